@@ -1,0 +1,1 @@
+"""Experiments: our integrators against path tracing. Not part of the installed package."""

@@ -1,0 +1,86 @@
+"""``envmap-render``: render, bake and diagnose from the shell.
+
+The stock ``mitsuba`` executable can't load plugins written in Python; this one echoes its flags.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NoReturn
+
+from envmap_integrator.cli import commands
+from envmap_integrator.cli.doctor import doctor
+from envmap_integrator.cli.errors import condense
+from envmap_integrator.cli.scene_file import parse_assignment, parse_setting
+
+EXIT_BAD_INPUT = 2
+EXIT_INTERRUPTED = 130
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; return the exit code: 0, 1 (``doctor`` found a fault) or 2 (bad input)."""
+    args = build_parser().parse_args(arguments)
+    try:
+        return args.command(args)
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
+    except (ValueError, TypeError, RuntimeError, ImportError, OSError) as error:
+        if args.debug:
+            raise
+        print(f"envmap-render: {condense(error)}", file=sys.stderr)
+        return EXIT_BAD_INPUT
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line, without the usage text."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(EXIT_BAD_INPUT, f"{self.prog}: {message} (see --help)\n")
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The command line, one sub-command a function of :mod:`envmap_integrator.cli.commands`."""
+    parser = _Parser(prog="envmap-render", description=__doc__)
+    subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    render = subparsers.add_parser("render", help="render a scene to an OpenEXR file")
+    _add_scene_options(render)
+    render.add_argument("-s", "--sensor", type=int, default=0, metavar="INDEX")
+    render.add_argument("-o", "--output", type=Path, help="default: beside the scene, .exr")
+    render.add_argument(
+        "--spp", type=int, default=0, help="samples per pixel, default: the scene's"
+    )
+    render.add_argument("--seed", type=int, default=0)
+    render.add_argument("--png", action="store_true", help="also write an sRGB PNG beside the EXR")
+    render.set_defaults(command=commands.render)
+
+    bake = subparsers.add_parser("bake", help="compute what rendering reuses, and save it")
+    _add_scene_options(bake)
+    bake.add_argument("-o", "--output", type=Path, required=True)
+    bake.set_defaults(command=commands.bake)
+
+    check = subparsers.add_parser("doctor", help="say what this machine can render with")
+    check.add_argument("--debug", action="store_true", help=argparse.SUPPRESS)
+    check.set_defaults(command=doctor)
+    return parser
+
+
+def _add_scene_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("scene", type=Path, metavar="SCENE.xml")
+    parser.add_argument("-m", "--mode", default="llvm_ad_rgb", metavar="VARIANT")
+    parser.add_argument("-t", "--threads", type=int, help="default: one per core")
+    parser.add_argument(
+        "-D", "--define", type=parse_assignment, action="append", default=[], metavar="KEY=VALUE",
+        help="define $KEY of the scene description",
+    )  # fmt: skip
+    parser.add_argument(
+        "--integrator", metavar="NAME", help="replaces the scene's; default: the scene's own"
+    )
+    parser.add_argument(
+        "--set", type=parse_setting, action="append", default=[], metavar="KEY=VALUE",
+        help="integrator parameter: true, false, an integer, a float (1.0) or a string",
+    )  # fmt: skip
+    parser.add_argument("--debug", action="store_true", help="show tracebacks")

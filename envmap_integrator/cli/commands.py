@@ -1,0 +1,134 @@
+"""The commands ``render`` and ``bake``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+from rich.console import Console
+from rich.table import Table
+
+import envmap_integrator
+from envmap_integrator.cli.output import replacing, write_png
+from envmap_integrator.cli.scene_file import SceneFile
+from envmap_integrator.cli.timing import compilation_time, measure, record_kernels
+from envmap_integrator.llvm import ensure_llvm
+
+
+def render(args: argparse.Namespace) -> int:
+    """Render one sensor; write the picture with its settings and stage times in its header."""
+    output = args.output or args.scene.with_suffix(".exr")
+    _check_output(output)
+    _require(args.spp >= 0, f"--spp must not be negative, got {args.spp}")
+    _configure_machine(args)
+    seconds: dict[str, float] = {}
+    with record_kernels():
+        scene_file, scene = _load(args, seconds)
+        sensor = _sensor(scene, args.sensor)
+        if hasattr(scene.integrator(), "prepare"):
+            seconds |= scene.integrator().prepare(scene).stage_times
+        with measure(seconds, "render"):
+            dr.eval(mi.render(scene, sensor=sensor, seed=args.seed, spp=args.spp))
+        compilation = compilation_time()
+
+    bitmap = sensor.film().bitmap()
+    settings = {
+        "scene": str(args.scene),
+        "defines": dict(args.define),
+        "variant": args.mode,
+        "sensor": args.sensor,
+        "spp": args.spp or sensor.sampler().sample_count(),
+        "seed": args.seed,
+        "integrator": scene_file.integrator.plugin_name(),
+        "integrator_settings": str(scene.integrator()),
+    }
+    metadata = bitmap.metadata()
+    metadata["envmap_integrator"] = envmap_integrator.__version__
+    metadata["settings"] = json.dumps(settings)
+    metadata["stage_times"] = json.dumps(seconds)
+    metadata["compilation_time"] = compilation
+    with replacing(output) as temporary:
+        bitmap.write(str(temporary))
+    if args.png:
+        write_png(output.with_suffix(".png"), bitmap)
+    _report(seconds, compilation, output)
+    return 0
+
+
+def bake(args: argparse.Namespace) -> int:
+    """Run the integrator's pre-passes alone and save their result."""
+    _check_output(args.output)
+    _configure_machine(args)
+    seconds: dict[str, float] = {}
+    with record_kernels():
+        scene_file, scene = _load(args, seconds)
+        name = scene_file.integrator.plugin_name()
+        _require(
+            hasattr(scene.integrator(), "prepare"),
+            f'integrator "{name}" has nothing to bake: pass --integrator envmap_hybrid',
+        )
+        state = scene.integrator().prepare(scene)
+        seconds |= state.stage_times
+        compilation = compilation_time()
+    with replacing(args.output) as temporary:
+        state.save(temporary)
+    _report(seconds, compilation, args.output)
+    return 0
+
+
+def activate_variant(name: str) -> None:
+    """``mi.set_variant``, with an error before Dr.Jit meets a libLLVM that would abort it."""
+    variants = mi.variants()
+    _require(name in variants, f'unknown variant "{name}": choose from {", ".join(variants)}')
+    if name.startswith("llvm_"):
+        ensure_llvm()
+    mi.set_variant(name)
+
+
+def _configure_machine(args: argparse.Namespace) -> None:
+    activate_variant(args.mode)
+    if args.threads is not None:
+        _require(args.threads >= 1, f"-t/--threads must be at least 1, got {args.threads}")
+        dr.set_thread_count(args.threads)
+
+
+def _load(args: argparse.Namespace, seconds: dict[str, float]) -> tuple[SceneFile, mi.Scene]:
+    with measure(seconds, "load"):
+        scene_file = SceneFile(args.scene, dict(args.define))
+        scene_file.configure_integrator(args.integrator, dict(args.set))
+        return scene_file, scene_file.load()
+
+
+def _sensor(scene: mi.Scene, index: int) -> mi.Sensor:
+    sensors = scene.sensors()
+    _require(
+        0 <= index < len(sensors),
+        f"-s/--sensor {index} is out of range: the scene has {len(sensors)} sensor(s)",
+    )
+    return sensors[index]
+
+
+def _check_output(path: Path) -> None:
+    """Fail before the work starts rather than after it."""
+    _require(path.suffix == ".exr", f'output "{path}" must end in .exr (--png adds a PNG)')
+    _require(path.parent.is_dir(), f'output folder "{path.parent}" does not exist: create it')
+
+
+def _require(condition: bool, message: str) -> None:
+    if not condition:
+        raise ValueError(message)
+
+
+def _report(seconds: dict[str, float], compilation: float, output: Path) -> None:
+    table = Table("stage", "seconds", box=None)
+    table.columns[1].justify = "right"
+    for stage, duration in seconds.items():
+        table.add_row(stage, f"{duration:.2f}")
+    table.add_row("total", f"{sum(seconds.values()):.2f}", style="bold")
+    table.add_row("of it compiling kernels", f"{compilation:.2f}", style="dim")
+    console = Console()
+    console.print(table)
+    console.print(f"wrote {output}", highlight=False, soft_wrap=True)

@@ -1,0 +1,26 @@
+"""Mitsuba's error messages, which span lines and name C++ files, as one line with a mend."""
+
+from __future__ import annotations
+
+import re
+
+_CPP_LOCATION = re.compile(r"\[\w+\.(?:cpp|h):\d+\] ")
+
+_MENDS = (
+    (re.compile(r"Plugin \"[^\"]*\" not found"), "check its spelling, or pass --integrator NAME"),
+    (re.compile(r"unreferenced propert"), "check the spelling, or remove it"),
+    (re.compile(r"undefined parameter: \$(\w+)"), r"pass -D \1=VALUE"),
+    (re.compile(r"unused parameters?: - \$(\w+)"), r"the scene has no $\1; remove -D \1"),
+    (re.compile(r"wrong type \(expected (\w+)"), r"give it as \1"),
+    (re.compile(r"file not found|does not exist"), "check the path"),
+)
+
+
+def condense(error: BaseException) -> str:
+    """The message on one line, without C++ locations, followed by what to do about it if known."""
+    text = _CPP_LOCATION.sub("", str(error)) or type(error).__name__
+    text = " ".join(text.split())
+    for pattern, mend in _MENDS:
+        if match := pattern.search(text):
+            return f"{text} ({match.expand(mend)})"
+    return text

@@ -1,0 +1,126 @@
+"""A scene description that can be changed between parsing and loading."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+
+DEFAULT_INTEGRATOR = "envmap_hybrid"
+
+
+class SceneFile:
+    """A parsed scene; each :meth:`load` makes new objects from it in the active variant.
+
+    Its integrator is replaced *before* anything is loaded, so that a scene may name one that
+    doesn't exist here. A scene without an integrator gets :data:`DEFAULT_INTEGRATOR`.
+
+    Parameters: ``path`` of the XML file; ``parameters``, values of its ``$name`` place-holders.
+    """
+
+    def __init__(self, path: Path, parameters: Mapping[str, str] | None = None):
+        if not path.is_file():
+            raise FileNotFoundError(f'scene "{path}" does not exist')
+        self._folder = path.parent
+        self._config = mi.parser.ParserConfig(mi.variant())
+        with _search_folder(self._folder):
+            self._state = mi.parser.parse_file(self._config, str(path), **(parameters or {}))
+        if self._state.root.type != mi.ObjectType.Scene:
+            raise ValueError(f'the root element of "{path}" must be a <scene>')
+        if not self._children(self._state.root, mi.ObjectType.Integrator):
+            self._append_child(self._state.root, mi.ObjectType.Integrator, DEFAULT_INTEGRATOR)
+
+    @property
+    def integrator(self) -> mi.Properties:
+        """Name and parameters of the integrator."""
+        return self._integrator_node.props
+
+    def configure_integrator(
+        self, name: str | None = None, settings: Mapping[str, Any] | None = None
+    ) -> None:
+        """Use the plugin ``name`` (None: the present one, with its parameters) and ``settings``."""
+        if name is not None and name != self.integrator.plugin_name():
+            self._integrator_node.props = mi.Properties(name)
+        for key, value in (settings or {}).items():
+            self.integrator[key] = value
+
+    def configure_films(self, width: int, height: int) -> None:
+        """Give every film this size [pixels], no crop window, and a box reconstruction filter."""
+        for film in [node for node in self._state.nodes if node.type == mi.ObjectType.Film]:
+            for key in [key for key in film.props.keys() if key.startswith("crop_")]:
+                del film.props[key]
+            film.props["width"], film.props["height"] = width, height
+            filters = self._children(film, mi.ObjectType.ReconstructionFilter)
+            for node in filters:
+                node.props = mi.Properties("box")
+            if not filters:
+                self._append_child(film, mi.ObjectType.ReconstructionFilter, "box")
+
+    def load(self) -> mi.Scene:
+        """Instantiate the scene."""
+        state = mi.parser.ParserState(self._state)
+        with _search_folder(self._folder):
+            mi.parser.transform_all(self._config, state)
+            return mi.parser.instantiate(self._config, state)
+
+    @property
+    def _integrator_node(self) -> mi.parser.SceneNode:
+        return self._children(self._state.root, mi.ObjectType.Integrator)[0]
+
+    def _children(
+        self, parent: mi.parser.SceneNode, kind: mi.ObjectType
+    ) -> list[mi.parser.SceneNode]:
+        references = [
+            value
+            for _, value in parent.props.items()
+            if isinstance(value, mi.Properties.ResolvedReference)
+        ]
+        nodes = [self._state.nodes[reference.index()] for reference in references]
+        return [node for node in nodes if node.type == kind]
+
+    def _append_child(self, parent: mi.parser.SceneNode, kind: mi.ObjectType, plugin: str) -> None:
+        # Link first: appending may move the nodes in memory, which invalidates `parent`.
+        index = len(self._state.nodes)
+        parent.props[f"_{plugin}"] = mi.Properties.ResolvedReference(index)
+        node = mi.parser.SceneNode()
+        node.type = kind
+        node.props = mi.Properties(plugin)
+        self._state.nodes.append(node)
+
+
+def parse_assignment(text: str) -> tuple[str, str]:
+    """Split ``key=value`` (an :mod:`argparse` type)."""
+    key, separator, value = text.partition("=")
+    if not (key and separator):
+        raise argparse.ArgumentTypeError(f'expected KEY=VALUE, got "{text}"')
+    return key, value
+
+
+def parse_setting(text: str) -> tuple[str, bool | int | float | str]:
+    """Split ``key=value``; spelling decides the type: ``true``, ``3``, ``0.5``, else a string."""
+    key, value = parse_assignment(text)
+    if value in ("true", "false"):
+        return key, value == "true"
+    for number in (int, float):
+        try:
+            return key, number(value)
+        except ValueError:
+            continue
+    return key, value
+
+
+@contextmanager
+def _search_folder(folder: Path) -> Iterator[None]:
+    """Let relative paths of a scene start at its own folder."""
+    outer = mi.file_resolver()
+    inner = mi.FileResolver(outer)
+    inner.prepend(str(folder))
+    mi.set_file_resolver(inner)
+    try:
+        yield
+    finally:
+        mi.set_file_resolver(outer)

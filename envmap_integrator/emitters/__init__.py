@@ -1,0 +1,1 @@
+"""Emitter plugins, one per file."""

@@ -1,0 +1,64 @@
+"""Recognises whether the content of a scene has changed, in this process and in others."""
+
+from __future__ import annotations
+
+import hashlib
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+
+class SceneFingerprint:
+    """Content hash of the parameters of all shapes, materials and emitters of a scene.
+
+    Sensors and films don't count: what is prepared serves every view. The content is read only
+    if an array of the scene has been replaced since the last call.
+    """
+
+    def __init__(self):
+        self._arrays = ()
+        self._indices = ()
+        self._scalars = ""
+        self._hash = ""
+
+    def __call__(self, scene: mi.Scene) -> str:
+        arrays, scalars = _parameters(scene)
+        indices = tuple(_index(array) for array in arrays)
+        if indices != self._indices or scalars != self._scalars or not self._hash:
+            digest = hashlib.blake2b(scalars.encode(), digest_size=16)
+            known: dict[tuple, bytes] = {}
+            for array, index in zip(arrays, indices, strict=True):
+                if index not in known:  # Shapes share materials and textures.
+                    data = np.ascontiguousarray(array.numpy())
+                    known[index] = hashlib.blake2b(data.tobytes(), digest_size=16).digest()
+                digest.update(known[index])
+            # Holding on to the arrays keeps Dr.Jit from giving their indices to others.
+            self._arrays, self._indices, self._scalars = arrays, indices, scalars
+            self._hash = digest.hexdigest()
+        return self._hash
+
+
+def _parameters(scene: mi.Scene) -> tuple[tuple, str]:
+    """Dr.Jit arrays and a text of everything else."""
+    arrays, scalars = [], [f"{len(mi.Spectrum())} channels"]
+    for item in (*scene.shapes(), *scene.emitters()):
+        scalars.append(f"{item.class_name()}")
+        if isinstance(item, mi.Shape):
+            scalars.append(str(item.bbox()))
+        for name, value in mi.traverse(item):
+            if dr.is_array_v(value) and dr.is_jit_v(value):
+                scalars.append(name)
+                arrays.append(value)
+            else:
+                scalars.append(f"{name}={value}")
+    return tuple(arrays), "\n".join(scalars)
+
+
+def _index(array) -> tuple:
+    """Identity of an array's data in Dr.Jit."""
+    if dr.is_tensor_v(array):
+        return (array.array.index, array.shape)
+    if dr.depth_v(array) > 1:
+        return tuple(_index(component) for component in array)
+    return (array.index,)

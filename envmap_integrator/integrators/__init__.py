@@ -1,0 +1,1 @@
+"""Integrator plugins, one per file."""

@@ -1,0 +1,102 @@
+"""What the integrators share: parameters of the radiosity pass, preparation, the sampling kernel."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..checks import check_scene, check_variant
+from ..fingerprint import SceneFingerprint
+from ..parameters import Parameters
+from ..pipeline import Prepared, Settings, load, prepare
+from ..radiosity.surface_points import ObjectIds
+from ..rendering.camera import camera_radiance
+from ..rendering.transport import Transport
+
+
+class CachedIntegrator(mi.SamplingIntegrator):
+    """Base of all integrators that end their paths in the irradiance cache.
+
+    Subclasses say what the pre-passes depend on (``settings``) and how paths are followed
+    (``transport``).
+    """
+
+    def __init__(self, props: mi.Properties):
+        check_variant(props.plugin_name())
+        super().__init__(props)
+        parameters = Parameters(props)
+        self.owner = parameters.owner
+        self.patches = parameters.integer("patches", 16384, 16, 1 << 22)
+        self.patch_samples = parameters.power_of_two("patch_samples", 128, 1, 1 << 16)
+        self.shadow_samples = parameters.integer("shadow_samples", 1, 1, 1 << 16)
+        self.secondary_samples = 1
+        self.cache_file = parameters.text("cache_file")
+        self._fingerprint = SceneFingerprint()
+        self._prepared: Prepared | None = None
+        self._object_ids: tuple | None = None
+
+    # ---------------------- To be overridden ----------------------
+
+    def settings(self, **more) -> Settings:
+        """What the pre-passes depend on besides the scene."""
+        return Settings(patches=self.patches, patch_samples=self.patch_samples, **more)
+
+    def transport(self, scene: mi.Scene, prepared: Prepared, spp: int) -> Transport:
+        """How paths are followed; ``spp`` samples share a pixel."""
+        raise NotImplementedError
+
+    def bake_with(self):
+        """The integrator that bakes maps, if any."""
+        return None
+
+    # ---------------------- Preparation ----------------------
+
+    def prepare(self, scene: mi.Scene) -> Prepared:
+        """Run the pre-passes that scene and settings ask for, unless they have been run.
+
+        The result doesn't depend on the view: other sensors reuse it. It's rebuilt when a
+        parameter of a shape, material or emitter of the scene changes.
+
+        Raises ``ValueError`` for scenes that can't be rendered and for a ``cache_file`` that is
+        missing, damaged, or of another scene or other settings.
+        """
+        key = f"{self._fingerprint(scene)} {self.settings()}"
+        if self._prepared is None or self._prepared.key != key:
+            check_scene(scene, self.owner)
+            if self.cache_file:
+                self._prepared = load(self.cache_file, key, self.owner)
+            else:
+                with dr.suspend_grad():
+                    self._prepared = prepare(scene, key, self.settings(), self.bake_with())
+        return self._prepared
+
+    def object_ids(self, scene: mi.Scene) -> ObjectIds:
+        """The ids of the scene at hand: other scenes of the same content have others."""
+        if self._object_ids is None or self._object_ids[0] is not scene:
+            self._object_ids = scene, ObjectIds(scene)
+        return self._object_ids[1]
+
+    # ---------------------- Rendering ----------------------
+
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        self.prepare(scene)
+        with dr.suspend_grad():
+            return super().render(scene, sensor, seed, spp, develop, evaluate)
+
+    def sample(self, scene, sampler, ray, medium=None, active=True):
+        radiance, _, valid = self.radiance(scene, self.prepare(scene), sampler, ray, active)
+        return radiance, valid, []
+
+    def radiance(self, scene, prepared, sampler, ray, active):
+        """Radiance [W/m²/sr] along rays, distance to the first hit, whether there was one."""
+        end = camera_radiance(
+            scene,
+            self.transport(scene, prepared, sampler.sample_count()),
+            sampler,
+            mi.Ray3f(ray),
+            mi.Bool(active),
+            self.shadow_samples,
+            self.secondary_samples,
+        )
+        cached = end.weight * prepared.cache.irradiance(end.row) * dr.inv_pi
+        return end.radiance + cached, end.distance, end.valid

@@ -1,0 +1,70 @@
+"""``envmap_bake``: bakes the maps of ``envmap_hybrid``."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..maps.bake import bake_map
+from ..maps.cube_map import CubeMap
+from ..parameters import Parameters
+from ..rendering.transport import Transport
+from .common import CachedIntegrator
+
+
+class EnvmapBake(CachedIntegrator):
+    r"""
+    Map baking integrator (:monosp:`envmap_bake`)
+
+    Radiance as a cube map holds it: direct light by shadow rays, indirect light from the irradiance
+    cache, specular surfaces followed; sources that the ray itself hits are left out, since the
+    renderer samples them (paper section 2, "map generation").
+
+    Nested in :monosp:`envmap_hybrid` under the name ``baker`` it fills the maps. As the integrator
+    of a scene it shows what a map would hold from the sensor's place; the AOV ``distance`` is the
+    distance [world units] to what is seen.
+
+    .. pluginparameters::
+
+     * - samples
+       - |int|
+       - Rays per texel, a power of two. (Default: 8)
+     * - patches
+       - |int|
+       - Budget of patches of the coarse mesh; unused when nested. (Default: 16384)
+     * - patch_samples
+       - |int|
+       - Gather rays and shadow rays per patch, a power of two; unused when nested. (Default: 128)
+     * - shadow_samples
+       - |int|
+       - Shadow rays where a bake ray hits. (Default: 1)
+    """
+
+    def __init__(self, props: mi.Properties):
+        super().__init__(props)
+        self.samples = Parameters(props).power_of_two("samples", 8, 1, 1 << 12)
+
+    def transport(self, scene, prepared, spp):
+        return Transport(
+            prepared.cache.patches, self.object_ids(scene), gather_depth=0, emission=False
+        )
+
+    def aov_names(self):
+        return ["distance"]
+
+    def sample(self, scene, sampler, ray, medium=None, active=True):
+        radiance, distance, valid = self.radiance(
+            scene, self.prepare(scene), sampler, ray, active
+        )
+        return radiance, valid, [dr.select(valid, distance, 0)]
+
+    def bake(self, scene, prepared, cluster, points, resolution, seed) -> CubeMap:
+        """Bake the map of a cluster whose surface points are ``points``.
+
+        ``prepared`` needs no more than the irradiance cache.
+        """
+
+        def radiance_distance(sampler, ray, active):
+            return self.radiance(scene, prepared, sampler, ray, active)[:2]
+
+        return bake_map(scene, radiance_distance, cluster, points, resolution, self.samples, seed)

@@ -1,0 +1,159 @@
+"""``envmap_hybrid``: trace near, look up far."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from ..emitters.mipmap_cube import MipmapCube
+from ..maps.far_field import FarField, far_field
+from ..parameters import Parameters
+from ..rendering.transport import Transport
+from .common import CachedIntegrator
+from .envmap_bake import EnvmapBake
+
+
+class EnvmapHybrid(CachedIntegrator):
+    r"""
+    Environment mapping for diffuse interreflection (:monosp:`envmap_hybrid`)
+
+    Secondary rays are traced only inside a cube around the cluster of objects they start from; those
+    that leave it read a prefiltered map of what lies beyond, at the mip level that the density
+    of the samples asks for. What they hit inside is shaded from the irradiance cache. Light
+    sources are reached by shadow rays (Reinhard, Tijssen and Jansen 1994).
+
+    Without any parameter, clusters are found automatically. Nested emitters
+    :monosp:`mipmap_cube` with ``shapes`` list them instead; a nested :monosp:`envmap_bake` sets how
+    maps are baked.
+
+    .. pluginparameters::
+
+     * - patches
+       - |int|
+       - Budget of patches of the coarse mesh, 16 … 4194304. (Default: 16384)
+     * - patch_samples
+       - |int|
+       - Gather rays and shadow rays per patch, a power of two. (Default: 128)
+     * - shadow_samples
+       - |int|
+       - Shadow rays at a camera hit (paper: 16). (Default: 1)
+     * - secondary_samples
+       - |int|
+       - Secondary rays at a camera hit (paper: 100). (Default: 1)
+     * - gather_depth
+       - |int|
+       - Non-specular bounces before a path may end in the cache; each is bounded by the cube of the
+         surface it starts from (paper Figure 2). (Default: 1)
+     * - second_hit
+       - |string|
+       - Direct light where secondary rays end: ``cache`` takes it from the cache, ``shadow_rays``
+         samples the sources there too. (Default: cache)
+     * - lookup
+       - |string|
+       - ``corrected`` finds the far hit by the distance in the map; ``plain`` looks up the bare
+         direction, as the paper does. (Default: corrected)
+     * - mirrors
+       - |string|
+       - ``trace`` follows perfect mirrors, and lobes finer than the map's texels, in full; ``map``
+         looks them up like all else. (Default: trace)
+     * - map_resolution
+       - |int|
+       - Texels along the edge of a map's face, a power of two up to 2048. (Default: 64)
+     * - distance_ratio
+       - |float|
+       - Half width of a cube over the radius of its cluster, at least 1. (Default: 2)
+     * - mip_bias
+       - |float|
+       - Levels added to every look-up, -32 … 32. (Default: 0)
+     * - cache_file
+       - |string|
+       - File with the baked state, from :monosp:`envmap-render bake`. (Default: none, bake now)
+     * - hide_emitters
+       - |bool|
+       - Hide directly visible emitters. (Default: false)
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="envmap_hybrid">
+                <float name="distance_ratio" value="3"/>
+                <integrator type="envmap_bake" name="baker">
+                    <integer name="samples" value="16"/>
+                </integrator>
+                <emitter type="mipmap_cube" id="desk">
+                    <string name="shapes" value="table, ball"/>
+                </emitter>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'envmap_hybrid',
+            'distance_ratio': 3.0,
+            'baker': {'type': 'envmap_bake', 'samples': 16},
+            'desk': {'type': 'mipmap_cube', 'shapes': 'table, ball'}
+    """
+
+    def __init__(self, props: mi.Properties):
+        super().__init__(props)
+        parameters = Parameters(props)
+        self.secondary_samples = parameters.integer("secondary_samples", 1, 1, 1 << 16)
+        self.gather_depth = parameters.integer("gather_depth", 1, 1, 64)
+        self.second_hit = parameters.choice("second_hit", "cache", ("cache", "shadow_rays"))
+        self.lookup = parameters.choice("lookup", "corrected", ("corrected", "plain"))
+        self.mirrors = parameters.choice("mirrors", "trace", ("trace", "map"))
+        self.map_resolution = parameters.power_of_two("map_resolution", 64, 1, 2048)
+        self.distance_ratio = parameters.number("distance_ratio", 2.0, 1.0)
+        self.mip_bias = parameters.number("mip_bias", 0.0, -32.0, 32.0)
+
+        self.baker = None
+        requests = []
+        for name, child in props.objects():
+            if isinstance(child, EnvmapBake) and self.baker is None:
+                self.baker = child
+            elif isinstance(child, MipmapCube) and child.request is not None:
+                requests.append(child.request)
+            else:
+                raise TypeError(
+                    f'{self.owner}: "{name}" must be one envmap_bake or a mipmap_cube with '
+                    f'"shapes", not {child.class_name()}'
+                )
+        self.requests = tuple(requests)
+        self.baker = self.baker or mi.load_dict({"type": "envmap_bake"})
+        self._far_field: tuple | None = None
+
+    def settings(self):
+        return super().settings(
+            maps=True,
+            map_resolution=self.map_resolution,
+            map_samples=self.baker.samples,
+            distance_ratio=self.distance_ratio,
+            requests=self.requests,
+        )
+
+    def bake_with(self):
+        return self.baker
+
+    def transport(self, scene, prepared, spp):
+        return Transport(
+            prepared.cache.patches,
+            self.object_ids(scene),
+            far_field=self._far_field_of(scene, prepared, spp),
+            gather_depth=self.gather_depth,
+            shadow_rays=self.second_hit == "shadow_rays",
+            hide_emitters=self.hide_emitters,
+        )
+
+    def _far_field_of(self, scene, prepared, spp) -> FarField | None:
+        """The maps where kernels read them, uploaded once for a prepared state and sample count."""
+        key = (id(scene), id(prepared), spp)
+        if self._far_field is None or self._far_field[0] != key:
+            n_samples = spp * self.secondary_samples
+            self._far_field = key, far_field(
+                scene,
+                prepared.maps,
+                prepared.cluster_of_patch,
+                n_samples,
+                self.mip_bias,
+                corrected=self.lookup == "corrected",
+                map_mirrors=self.mirrors == "map",
+            )
+        return self._far_field[1]

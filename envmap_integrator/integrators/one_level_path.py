@@ -1,0 +1,38 @@
+"""``one_level_path``: the paper's "path tracing", one bounce and then the cache."""
+
+from __future__ import annotations
+
+from ..rendering.transport import Transport
+from .common import CachedIntegrator
+
+
+class OneLevelPath(CachedIntegrator):
+    r"""
+    One-level path tracing (:monosp:`one_level_path`)
+
+    Direct light by shadow rays; secondary rays are traced in full and end in the irradiance cache
+    at what they hit (Rushmeier 1988; paper section 3, "path tracing").
+
+    .. pluginparameters::
+
+     * - patches
+       - |int|
+       - Budget of patches of the coarse mesh. (Default: 16384)
+     * - patch_samples
+       - |int|
+       - Gather rays and shadow rays per patch, a power of two. (Default: 128)
+     * - shadow_samples
+       - |int|
+       - Shadow rays at a camera hit. (Default: 1)
+     * - hide_emitters
+       - |bool|
+       - Hide directly visible emitters. (Default: false)
+    """
+
+    def transport(self, scene, prepared, spp):
+        return Transport(
+            prepared.cache.patches,
+            self.object_ids(scene),
+            gather_depth=1,
+            hide_emitters=self.hide_emitters,
+        )

@@ -1,0 +1,38 @@
+"""``source_selection``: direct and specular rays; diffuse indirect light from the cache."""
+
+from __future__ import annotations
+
+from ..rendering.transport import Transport
+from .common import CachedIntegrator
+
+
+class SourceSelection(CachedIntegrator):
+    r"""
+    Two-pass radiosity with source sampling (:monosp:`source_selection`)
+
+    Direct light by shadow rays, specular reflection by rays; diffuse indirect light is read from
+    the irradiance cache where the camera looks (Kok and Jansen 1991; paper section 3).
+
+    .. pluginparameters::
+
+     * - patches
+       - |int|
+       - Budget of patches of the coarse mesh. (Default: 16384)
+     * - patch_samples
+       - |int|
+       - Gather rays and shadow rays per patch, a power of two. (Default: 128)
+     * - shadow_samples
+       - |int|
+       - Shadow rays at a camera hit. (Default: 1)
+     * - hide_emitters
+       - |bool|
+       - Hide directly visible emitters. (Default: false)
+    """
+
+    def transport(self, scene, prepared, spp):
+        return Transport(
+            prepared.cache.patches,
+            self.object_ids(scene),
+            gather_depth=0,
+            hide_emitters=self.hide_emitters,
+        )

@@ -1,0 +1,1 @@
+"""Stage 2: clusters of objects and the cube maps of what lies beyond them."""

@@ -1,0 +1,81 @@
+"""The map of one cluster as a record, and its files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..storage import Parts, StorageError
+from .clusters import Cluster
+from .cube import n_levels
+
+#: Names of the radiance channels, by their number.
+RADIANCE_CHANNELS = {1: ("Y",), 3: ("R", "G", "B")}
+
+
+@dataclass(frozen=True)
+class CubeMap:
+    """The map of one cluster.
+
+    cluster   what it is the map of
+    levels    [6, R_l, R_l, C + 1] per level, finest first: radiance [W/m²/sr], inverse distance
+              [1/m] from the cube's centre
+    masked    share of finest texels that no ray from the cluster reaches
+    """
+
+    cluster: Cluster
+    levels: list[np.ndarray]
+    masked: float
+
+    @property
+    def resolution(self) -> int:
+        return self.levels[0].shape[1]
+
+    def texels(self) -> np.ndarray:
+        """All levels in one row, [T, C + 1], as ``cube`` lays them out."""
+        return np.concatenate([level.reshape(-1, level.shape[-1]) for level in self.levels])
+
+
+def to_parts(cube_map: CubeMap, prefix: str = "") -> tuple[Parts, dict]:
+    """EXR parts, one a level with the six faces side by side, and metadata of a map."""
+    n_channels = cube_map.levels[0].shape[-1] - 1
+    names = (*RADIANCE_CHANNELS[n_channels], "inverse_distance")
+    parts = {}
+    for number, level in enumerate(cube_map.levels):
+        image = np.concatenate(list(level), axis=1)
+        parts[f"{prefix}level{number}"] = {
+            name: np.ascontiguousarray(image[..., i]) for i, name in enumerate(names)
+        }
+    cluster = cube_map.cluster
+    metadata = {
+        "name": cluster.name,
+        "objects": cluster.objects.tolist(),
+        "centre": cluster.centre.tolist(),
+        "radius": cluster.radius,
+        "half_width": cluster.half_width,
+        "resolution": cube_map.resolution,
+        "masked": cube_map.masked,
+    }
+    return parts, metadata
+
+
+def from_parts(parts: Parts, metadata: dict, prefix: str = "") -> CubeMap:
+    """The map that ``to_parts`` has taken apart."""
+    try:
+        levels = []
+        for number in range(n_levels(metadata["resolution"])):
+            channels = parts[f"{prefix}level{number}"]
+            names = next(n for n in RADIANCE_CHANNELS.values() if n[0] in channels)
+            image = np.stack([channels[name] for name in (*names, "inverse_distance")], axis=-1)
+            levels.append(np.stack(np.split(image, 6, axis=1)))
+        cluster = Cluster(
+            metadata["name"],
+            np.array(metadata["objects"], dtype=np.int64),
+            np.array(metadata["centre"]),
+            metadata["radius"],
+            metadata["half_width"],
+        )
+    except (KeyError, StopIteration) as error:
+        raise StorageError(f"a part of the map is missing: {error}") from None
+    return CubeMap(cluster, levels, metadata["masked"])

@@ -1,0 +1,185 @@
+"""The maps of all clusters, as the renderer reads them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .cube import direction_to_face, exit_distance, face_to_direction, texel
+from .cube_map import CubeMap
+
+#: Steps of the fixed point iteration that finds the far hit (Szirmay-Kalos et al. 2005).
+CORRECTION_STEPS = 3
+#: A far hit is trusted if the map's distance there agrees with it to this fraction.
+DISTANCE_TOLERANCE = 0.1
+#: Lobes that cover fewer finest-level texels than this are traced in full, not looked up.
+MIN_LOBE_TEXELS = 32.0
+#: Rays are traced up to this fraction beyond the cube, at random, so that its border turns into
+#: noise. Never less: the map doesn't hold what is inside.
+HAND_OFF = 0.1
+
+
+@dataclass(frozen=True)
+class FarField:
+    """Radiance and distance beyond the cubes of all clusters.
+
+    cubes              [M * 4]   centre and half width of each cube, world units
+    texels             [M * T * (C + 1)]  radiance [W/m²/sr] by C channels and inverse distance
+                                 [1/m] from the centre; T texels a map, laid out as in ``cube``
+    cluster_of_patch   [P]       cluster index, M where a patch belongs to none
+    resolution         [1]       face resolution R of the finest level
+    n_samples          [1]       samples that share a pixel: spp times secondary samples
+    mip_bias           [1]       levels added to the look-up
+    map_mirrors        whether mirrors and lobes finer than texels read the map (else traced)
+    corrected          whether look-ups use the distance (else the bare direction, as the paper)
+    sources            scene of the emitters' shapes alone
+    has_environment    whether the scene has an environment emitter
+    """
+
+    cubes: mi.Float
+    texels: mi.Float
+    cluster_of_patch: mi.UInt32
+    n_clusters: mi.UInt32
+    resolution: mi.UInt32
+    n_samples: mi.Float
+    mip_bias: mi.Float
+    corrected: bool
+    map_mirrors: bool
+    sources: mi.Scene | None
+    has_environment: bool
+
+    def bound(self, patch, ray, pdf, specular, u, active):
+        """Bound a ray that starts on a patch by the cube of the patch's cluster.
+
+        Returns ``(cluster, bounded, maxt)``. Rays from outside their cube and lobes too narrow
+        for the map's texels aren't bounded.
+        """
+        cluster = dr.gather(mi.UInt32, self.cluster_of_patch, patch, active)
+        bounded = active & (cluster < self.n_clusters)
+        texel_solid_angle = 4 / dr.square(mi.Float(self.resolution))
+        if not self.map_mirrors:
+            bounded &= ~specular & (pdf * texel_solid_angle * MIN_LOBE_TEXELS < 1)
+        centre, half_width = self._cube(cluster, bounded)
+        t = exit_distance(centre, half_width, ray.o, ray.d)
+        bounded &= t > 0
+        t *= 1 + HAND_OFF * u
+        return cluster, bounded, dr.select(bounded, t, dr.largest(mi.Float))
+
+    def eval(self, cluster, o, d, pdf, specular, u_level, u_texel, active):
+        """Far radiance along rays that have left their cube, from the prefiltered map.
+
+        Returns the radiance [W/m²/sr] and whether it can be trusted. The level is chosen so that
+        a texel covers what the sample stands for (paper section 2, Figure 4; Křivánek and Colbert
+        2008): 1 / (N pdf) sr, as seen from the cube's centre.
+        """
+        centre, _ = self._cube(cluster, active)
+        far = mi.Vector3f(d)
+        trusted = mi.Bool(True)
+        footprint = mi.Float(1)
+        if self.corrected:
+            offset = o - centre
+            b = dr.dot(offset, d)
+            c = dr.squared_norm(offset)
+            for _ in range(CORRECTION_STEPS):
+                inverse = self._inverse_distance(cluster, far, active)
+                # |offset + t d| = 1 / inverse, in a form that stands infinite distance.
+                t = dr.safe_sqrt(dr.rcp(dr.square(inverse)) - c + b * b) - b
+                far = dr.select(inverse > 0, offset + t * d, d)
+            inverse_at = self._inverse_distance(cluster, far, active)
+            distance = dr.select(inverse > 0, dr.norm(far), dr.inf)
+            trusted = dr.select(
+                inverse > 0,
+                dr.abs(inverse_at * distance - 1) < DISTANCE_TOLERANCE,
+                inverse_at == 0,
+            )
+            footprint = dr.select(inverse > 0, dr.square(t / distance), 1)
+
+        face, uv = direction_to_face(far)
+        solid_angle = footprint / (self.n_samples * pdf)
+        solid_angle = dr.select(specular, 0, solid_angle)
+        texels = solid_angle * dr.square(mi.Float(self.resolution)) * 0.25
+        texels *= (1 + dr.squared_norm(uv)) ** 1.5
+        level = 0.5 * dr.log2(dr.maximum(texels, 1e-6)) + self.mip_bias
+        coarsest = mi.Float(31 - dr.lzcnt(self.resolution))
+        # Stochastic trilinear filtering: one packed gather, seam free because the jittered
+        # direction may fall on a neighbouring face.
+        level = mi.UInt32(dr.clip(dr.floor(level + u_level), 0, coarsest))
+        level_resolution = self.resolution >> level
+        uv += (2 * u_texel - 1) / mi.Float(level_resolution)
+        face, uv = direction_to_face(face_to_direction(face, uv))
+        value = self._fetch(cluster, face, uv, level_resolution, active)
+        n_channels = len(mi.Spectrum())
+        return mi.Spectrum(*(value[i] for i in range(n_channels))), trusted
+
+    def intersect_sources(self, scene, ray, active):
+        """Find the source that a ray beyond its cube reaches, if any.
+
+        Cheap and exact: the ray meets a scene of emitters only, and visibility is tested where it
+        hits one. Returns a surface interaction (invalid for the environment) and its visibility.
+        """
+        if self.sources is None:
+            si = dr.zeros(mi.SurfaceInteraction3f)
+            si.t = dr.inf
+            si.wi = -ray.d
+            found = active & self.has_environment
+        else:
+            si = self.sources.ray_intersect(ray, active)
+            found = active & (si.is_valid() | self.has_environment)
+        ray = mi.Ray3f(ray)
+        ray.maxt = dr.select(si.is_valid(), si.t * (1 - 1e-4), dr.largest(mi.Float))
+        return si, found & ~scene.ray_test(ray, found)
+
+    def _cube(self, cluster, active):
+        cube = dr.gather(mi.Vector4f, self.cubes, cluster, active)
+        return mi.Point3f(cube.x, cube.y, cube.z), cube.w
+
+    def _inverse_distance(self, cluster, d, active):
+        face, uv = direction_to_face(d)
+        return self._fetch(cluster, face, uv, self.resolution, active)[len(mi.Spectrum())]
+
+    def _fetch(self, cluster, face, uv, level_resolution, active):
+        n_texels = 8 * self.resolution * self.resolution - 2
+        index = cluster * n_texels + texel(face, uv, self.resolution, level_resolution)
+        return dr.gather(texel_type(), self.texels, index, active)
+
+
+def far_field(
+    scene: mi.Scene,
+    maps: tuple[CubeMap, ...],
+    cluster_of_patch: np.ndarray,
+    n_samples: int,
+    mip_bias: float,
+    corrected: bool,
+    map_mirrors: bool,
+) -> FarField | None:
+    """Put the maps of a scene where kernels can read them; None if there are no maps."""
+    if not maps:
+        return None
+    cubes = [[*cube_map.cluster.centre, cube_map.cluster.half_width] for cube_map in maps]
+    return FarField(
+        cubes=mi.Float(np.array(cubes, dtype=np.float32).ravel()),
+        texels=mi.Float(np.concatenate([cube_map.texels() for cube_map in maps]).ravel()),
+        cluster_of_patch=mi.UInt32(cluster_of_patch),
+        n_clusters=dr.opaque(mi.UInt32, len(maps)),
+        resolution=dr.opaque(mi.UInt32, maps[0].resolution),
+        n_samples=dr.opaque(mi.Float, n_samples),
+        mip_bias=dr.opaque(mi.Float, mip_bias),
+        corrected=corrected,
+        map_mirrors=map_mirrors,
+        sources=_source_scene(scene),
+        has_environment=scene.environment() is not None,
+    )
+
+
+def _source_scene(scene: mi.Scene) -> mi.Scene | None:
+    """A scene of the emitters' shapes alone."""
+    shapes = {f"shape{i}": s for i, s in enumerate(scene.shapes()) if s.is_emitter()}
+    return mi.load_dict({"type": "scene", **shapes}) if shapes else None
+
+
+def texel_type():
+    """Type of a packed texel: radiance and inverse distance."""
+    return {1: mi.Vector2f, 3: mi.Vector4f}[len(mi.Spectrum())]

@@ -1,0 +1,65 @@
+"""Validated access to plugin parameters: Mitsuba's own ``props.get`` checks neither type nor range."""
+
+from __future__ import annotations
+
+import math
+
+import mitsuba as mi
+
+
+class Parameters:
+    """Reads the properties of one plugin; every complaint names the plugin and the property.
+
+    Properties that nothing reads are left to Mitsuba, which rejects them by name.
+    """
+
+    def __init__(self, props: mi.Properties):
+        self._props = props
+        self.owner = f'{props.plugin_name()} "{props.id()}"' if props.id() else props.plugin_name()
+
+    def integer(self, name: str, default: int, low: int, high: int = 2**31 - 1) -> int:
+        value = self._props.get(name, default)
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise TypeError(f'{self.owner}: "{name}" must be an integer, not {value!r}')
+        return self._in_range(name, value, low, high)
+
+    def power_of_two(self, name: str, default: int, low: int, high: int) -> int:
+        value = self.integer(name, default, low, high)
+        if value & (value - 1):
+            raise ValueError(f'{self.owner}: "{name}" must be a power of two, not {value}')
+        return value
+
+    def number(
+        self, name: str, default: float | None, low: float, high: float = math.inf
+    ) -> float | None:
+        if default is None and not self._props.has_property(name):
+            return None
+        value = self._props.get(name, default)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise TypeError(f'{self.owner}: "{name}" must be a number, not {value!r}')
+        return float(self._in_range(name, value, low, high))
+
+    def flag(self, name: str, default: bool) -> bool:
+        value = self._props.get(name, default)
+        if not isinstance(value, bool):
+            raise TypeError(f'{self.owner}: "{name}" must be true or false, not {value!r}')
+        return value
+
+    def choice(self, name: str, default: str, choices: tuple[str, ...]) -> str:
+        value = self._props.get(name, default)
+        if value not in choices:
+            allowed = " or ".join(f'"{choice}"' for choice in choices)
+            raise ValueError(f'{self.owner}: "{name}" must be {allowed}, not {value!r}')
+        return value
+
+    def text(self, name: str, default: str = "") -> str:
+        value = self._props.get(name, default)
+        if not isinstance(value, str):
+            raise TypeError(f'{self.owner}: "{name}" must be a string, not {value!r}')
+        return value
+
+    def _in_range(self, name, value, low, high):
+        if not low <= value <= high:
+            upper = f" and at most {high:g}" if math.isfinite(high) else ""
+            raise ValueError(f'{self.owner}: "{name}" must be at least {low:g}{upper}, not {value}')
+        return value

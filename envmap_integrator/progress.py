@@ -1,0 +1,67 @@
+"""A progress bar for the stages that make the user wait, and nothing for those that don't.
+
+.. code-block:: python
+
+    with stage("radiosity", total=patch_count) as advance:
+        for batch in batches:
+            ...
+            advance(len(batch))
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from threading import Timer
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+quiet = False
+"""Set to True to show no bars in this process."""
+
+DELAY = 2.0
+"""Seconds that a stage may last before its bar appears."""
+
+_display: Progress | None = None
+
+
+@contextmanager
+def stage(name: str, total: float | None = None) -> Iterator[Callable[[float], None]]:
+    """Show a bar for the block on stderr once it has lasted :data:`DELAY` seconds.
+
+    Yields ``advance(steps)``. A bar without ``total`` only shows that work goes on. Bars appear on
+    terminals only, or with the environment variable ``ENVMAP_PROGRESS=1``. Stages may nest.
+    """
+    global _display
+    forced = os.environ.get("ENVMAP_PROGRESS") == "1"
+    console = Console(stderr=True, force_terminal=True if forced else None)
+    if quiet or not console.is_terminal:
+        yield lambda steps: None
+        return
+
+    # Rich allows one live display a process: nested stages are rows of the outermost one.
+    outermost = _display is None
+    display = _display = _display or Progress(
+        TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(),
+        console=console, transient=True,
+    )  # fmt: skip
+    task = display.add_task(name, total=total, visible=False)
+
+    def show() -> None:
+        display.update(task, visible=True)
+        display.start()
+
+    timer = Timer(DELAY, show)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield lambda steps: display.advance(task, steps)
+    finally:
+        timer.cancel()
+        timer.join()
+        display.remove_task(task)
+        if outermost:
+            display.stop()
+            _display = None

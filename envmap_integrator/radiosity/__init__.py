@@ -1,0 +1,1 @@
+"""Stage 1: a coarse mesh of patches over every surface, and the irradiance they receive."""

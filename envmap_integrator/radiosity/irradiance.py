@@ -1,0 +1,188 @@
+"""The radiosity pass: irradiance on the patches, by gathering (paper section 1, 2).
+
+One batch of rays per patch measures the light transport between patches once, as in ray tracing
+based radiosity (Wallace et al. 1987). The radiosity system is then solved over those records for
+any number of bounces without tracing another ray.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..progress import stage
+from .patches import Patches
+from .surface_points import SurfacePoints
+
+if TYPE_CHECKING:
+    from ..rendering.transport import Transport
+
+#: Relative change of the irradiance at which the solution counts as converged.
+TOLERANCE = 1e-4
+MAX_ITERATIONS = 256
+#: Gather rays per kernel launch: bounds memory.
+MAX_LANES = 1 << 22
+
+
+@dataclass(frozen=True)
+class IrradianceCache:
+    """Irradiance on both the patches' sides (a side is a patch of its own).
+
+    patches   the coarse mesh
+    table     [2 * P * C]  W/m²: row 2p total, row 2p + 1 indirect irradiance of patch p, by C
+                           colour channels
+    """
+
+    patches: Patches
+    table: mi.Float
+
+    def irradiance(self, row: mi.UInt32, active=True) -> mi.Spectrum:
+        """Irradiance [W/m²] in a row of the table."""
+        return dr.gather(mi.Spectrum, self.table, row, active)
+
+
+def solve_irradiance(
+    scene: mi.Scene,
+    transport: Transport,
+    points: SurfacePoints,
+    patch_of_point: np.ndarray,
+    samples: int,
+    seed: int = 0,
+) -> IrradianceCache:
+    """Gather and solve for the irradiance of every patch.
+
+    ``samples`` rays start from random ones of a patch's surface points, with as many shadow rays;
+    ``samples`` must be a power of two. With E_d the direct and E_i the indirect irradiance,
+    b the light that gather rays find outside the patches, and w the throughput with which they
+    end in patch j, the solution fulfils E_i = mean(π b + w E(j)), where E(j) is E_d + E_i or E_i.
+    """
+    n_patches = transport.patches.count
+    order = np.argsort(patch_of_point, kind="stable")
+    order = order[patch_of_point[order] >= 0]
+    points = points.take(order)
+    first = np.searchsorted(patch_of_point[order], np.arange(n_patches + 1))
+
+    launch = max(MAX_LANES // samples, 1)
+    parts = []
+    with stage("Gathering irradiance", total=n_patches) as advance:
+        for begin in range(0, n_patches, launch):
+            end = min(begin + launch, n_patches)
+            parts.append(
+                _gather(scene, transport, points, first, begin, end, samples, seed + 1 + begin)
+            )
+            advance(end - begin)
+    direct, escaped, weight, row = (
+        parts[0][i] if len(parts) == 1 else dr.concat([part[i] for part in parts], axis=-1)
+        for i in range(4)
+    )
+    return IrradianceCache(transport.patches, _solve(direct, escaped, weight, row, samples))
+
+
+def _gather(scene, transport, points, first, begin, end, samples, seed):
+    """Trace the gather rays of patches ``begin`` … ``end``.
+
+    Returns direct irradiance and π b per patch, throughput and row per ray.
+    """
+    from ..rendering.transport import PathState, follow, mis_weight
+
+    n_lanes = (end - begin) * samples
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, n_lanes)
+    lane = dr.arange(mi.UInt32, n_lanes)
+    log_samples = dr.opaque(mi.UInt32, int(np.log2(samples)))
+    patch = lane >> log_samples
+    k = lane & (dr.opaque(mi.UInt32, samples) - 1)
+
+    # ---- A point of the patch ----
+    first_point = dr.gather(mi.UInt32, mi.UInt32(first[begin:]), patch)
+    n_points = dr.gather(mi.UInt32, mi.UInt32(first[begin:]), patch + 1) - first_point
+    index = first_point + dr.minimum(
+        mi.UInt32(sampler.next_1d() * mi.Float(n_points)), n_points - 1
+    )
+    normal = dr.gather(mi.Normal3f, mi.Float(points.normal.ravel()), index)
+    shading_normal = dr.gather(mi.Normal3f, mi.Float(points.shading_normal.ravel()), index)
+    si = dr.zeros(mi.SurfaceInteraction3f, n_lanes)
+    si.p = dr.gather(mi.Point3f, mi.Float(points.position.ravel()), index)
+    si.n = normal
+    si.sh_frame = mi.Frame3f(shading_normal)
+    si.t = 0
+
+    # ---- Direction: cosine, stratified over the rays of a patch ----
+    rotation = [
+        mi.sample_tea_float32(patch, dr.opaque(mi.UInt32, 2 * seed + i), 4) for i in range(2)
+    ]
+    u = mi.Point2f(
+        mi.Float(k) / dr.opaque(mi.Float, samples) + rotation[0],
+        mi.radical_inverse_2(k, 0) + rotation[1],
+    )
+    wo = mi.warp.square_to_cosine_hemisphere(u - dr.floor(u))
+    pdf = mi.warp.square_to_cosine_hemisphere_pdf(wo)
+    direction = si.to_world(wo)
+
+    # ---- Direct light, by shadow rays and by the gather rays that hit a source ----
+    ds, em_weight = scene.sample_emitter_direction(si, sampler.next_2d(), True)
+    cosine = dr.maximum(dr.dot(shading_normal, ds.d), 0)
+    cosine = dr.select(dr.dot(normal, ds.d) > 0, cosine, 0)
+    mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, cosine * dr.inv_pi))
+    direct = em_weight * cosine * mis
+
+    start = PathState(
+        ray=si.spawn_ray(direction),
+        depth=mi.UInt32(1),
+        origin=mi.Interaction3f(si),
+        pdf=pdf,
+        specular=mi.Bool(False),
+        bounded=mi.Bool(False),
+        cluster=mi.UInt32(0),
+    )
+    above = (dr.dot(normal, direction) > 0) & (wo.z > 0)
+    end_ = follow(scene, transport, sampler, start, above)
+    direct += dr.pi * end_.direct
+    escaped = dr.pi * (end_.radiance - end_.direct)
+
+    def mean(x):
+        return type(x)(*(dr.block_sum(finite(c), samples) / samples for c in x))
+
+    direct, escaped = mean(direct), mean(escaped)
+    weight = type(end_.weight)(*(finite(c) for c in end_.weight))
+    dr.eval(direct, escaped, weight, end_.row)
+    return direct, escaped, weight, end_.row
+
+
+def finite(x):
+    """Zero in place of infinities and NaN, which degenerate geometry may bring."""
+    return dr.select(dr.isfinite(x), x, 0)
+
+
+def _solve(direct, escaped, weight, row, samples):
+    """Iterate E_i = escaped + mean(w E(row)) to convergence; returns the irradiance table."""
+    direct, escaped = dr.ravel(direct), dr.ravel(escaped)
+    n_channels = len(weight)
+    patch = dr.arange(mi.UInt32, dr.width(direct) // n_channels)
+    table = dr.zeros(mi.Float, 2 * dr.width(direct))
+
+    def store(indirect):
+        total = dr.unravel(mi.Spectrum, direct + indirect)
+        dr.scatter(table, total, 2 * patch)
+        dr.scatter(table, dr.unravel(mi.Spectrum, indirect), 2 * patch + 1)
+        dr.eval(table)
+
+    indirect = mi.Float(escaped)
+    with stage("Solving irradiance"):
+        for _ in range(MAX_ITERATIONS):
+            store(indirect)
+            arriving = weight * dr.gather(mi.Spectrum, table, row)
+            arriving = mi.Spectrum(*(dr.block_sum(c, samples) / samples for c in arriving))
+            updated = escaped + dr.ravel(arriving)
+            change = dr.sum(dr.abs(updated - indirect))
+            level = dr.sum(direct + updated)
+            dr.eval(updated, change, level)
+            indirect = updated
+            if change[0] <= TOLERANCE * level[0]:
+                break
+    store(indirect)
+    return table

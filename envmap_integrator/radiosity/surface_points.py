@@ -1,0 +1,161 @@
+"""Points spread over the surfaces of a scene, found by casting rays.
+
+Rays reach every shape that can be hit, whatever its type: merged meshes, instances, spheres,
+curves. The cost doesn't depend on the number of triangles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+#: Hits followed along each global line, and along each walk from a sensor.
+LINE_HITS, WALK_HITS = 8, 4
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Oriented points on surfaces; a point belongs to the side from which it was hit.
+
+    position        [N, 3]  world space
+    normal          [N, 3]  geometric normal, facing the side the point belongs to
+    shading_normal  [N, 3]  shading normal, on the same side
+    object_id       [N]     dense index of the top-level shape (``ObjectIds``)
+    seen            [N]     1 for a point on a walk from a sensor, 0 on a global line
+    """
+
+    position: np.ndarray
+    normal: np.ndarray
+    shading_normal: np.ndarray
+    object_id: np.ndarray
+    seen: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+    def take(self, index: np.ndarray) -> SurfacePoints:
+        """The points of the given indices, in that order."""
+        return SurfacePoints(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+
+    @staticmethod
+    def concatenate(parts: list[SurfacePoints]) -> SurfacePoints:
+        return SurfacePoints(
+            *(
+                np.concatenate([getattr(part, name) for part in parts])
+                for name in SurfacePoints.__dataclass_fields__
+            )
+        )
+
+
+class ObjectIds:
+    """Dense index of the top-level shape under an interaction, in the order of the scene file.
+
+    Dr.Jit's own registry ids are global to the process and change from run to run; these don't,
+    so what is stored by object id can be saved.
+    """
+
+    def __init__(self, scene: mi.Scene):
+        registry_ids = dr.reinterpret_array(mi.UInt32, scene.shapes_dr()).numpy()
+        table = np.zeros(int(registry_ids.max(initial=0)) + 1, dtype=np.uint32)
+        table[registry_ids] = np.arange(len(registry_ids), dtype=np.uint32)
+        self.count = len(registry_ids)
+        self._table = mi.UInt32(table)
+
+    def __call__(self, si: mi.SurfaceInteraction3f) -> mi.UInt32:
+        shape = dr.reinterpret_array(mi.UInt32, si.shape)
+        instance = dr.reinterpret_array(mi.UInt32, si.instance)
+        index = dr.select(instance != 0, instance, shape)
+        return dr.gather(mi.UInt32, self._table, index, si.is_valid())
+
+
+def scatter_points(
+    scene: mi.Scene, object_ids: ObjectIds, count: int, seed: int = 0
+) -> SurfacePoints:
+    """Spread about ``count`` points over the surfaces of a scene.
+
+    Half come from global lines, uniform in position and direction, which hit all surfaces in
+    proportion to their area (Cauchy-Crofton; Sbert 1993). Half come from walks that start at the
+    scene's sensors and follow the BSDFs: that is where the renderer will ask.
+    """
+    sampler = mi.load_dict({"type": "independent"})
+    sensors = scene.sensors()
+    parts = []
+
+    n_walks = count // (2 * WALK_HITS)
+    for index, sensor in enumerate(sensors):
+        n = max(n_walks // len(sensors), 1)
+        sampler.seed(seed * 1009 + index + 1, n)
+        ray = _sensor_rays(sensor, sampler)
+        parts += _hits_along(scene, object_ids, sampler, ray, WALK_HITS, bounce=True)
+
+    n_lines = (count if not sensors else count // 2) // (LINE_HITS // 2)
+    sampler.seed(seed * 1009, n_lines)
+    ray = _global_lines(scene, sampler)
+    parts += _hits_along(scene, object_ids, sampler, ray, LINE_HITS, bounce=False)
+    return SurfacePoints.concatenate(parts)
+
+
+def _sensor_rays(sensor: mi.Sensor, sampler: mi.Sampler) -> mi.Ray3f:
+    time = sensor.shutter_open() + sensor.shutter_open_time() * sampler.next_1d()
+    ray, _ = sensor.sample_ray(time, sampler.next_1d(), sampler.next_2d(), sampler.next_2d())
+    return mi.Ray3f(ray)
+
+
+def _global_lines(scene: mi.Scene, sampler: mi.Sampler) -> mi.Ray3f:
+    """Lines of uniform measure through the bounding sphere."""
+    sphere = scene.bbox().bounding_sphere()
+    direction = mi.warp.square_to_uniform_sphere(sampler.next_2d())
+    disk = mi.warp.square_to_uniform_disk_concentric(sampler.next_2d())
+    frame = mi.Frame3f(direction)
+    offset = frame.to_world(mi.Vector3f(disk.x, disk.y, -1.01))
+    return mi.Ray3f(mi.Point3f(sphere.center) + sphere.radius * offset, direction)
+
+
+def _hits_along(
+    scene: mi.Scene,
+    object_ids: ObjectIds,
+    sampler: mi.Sampler,
+    ray: mi.Ray3f,
+    n_hits: int,
+    bounce: bool,
+) -> list[SurfacePoints]:
+    """Follow rays over ``n_hits`` hits, bouncing off surfaces or passing straight through them."""
+    ctx = mi.BSDFContext()
+    active = dr.full(mi.Bool, True, dr.width(ray))
+    parts = []
+    for _ in range(n_hits):
+        dr.eval(ray, active)
+        si = scene.ray_intersect(ray, active)
+        active &= si.is_valid()
+        bsdf = si.bsdf()
+        facing = dr.dot(si.n, ray.d) < 0
+        normal = dr.select(facing, si.n, -si.n)
+        shading_normal = si.sh_frame.n
+        shading_normal = dr.mulsign(shading_normal, dr.dot(shading_normal, normal))
+        keep = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        keep &= dr.all(dr.isfinite(si.p)) & dr.all(dr.isfinite(shading_normal))
+        keep &= dr.squared_norm(normal) > 0.5
+        objects = object_ids(si)
+
+        direction = ray.d
+        if bounce:
+            bs, weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), active)
+            direction = si.to_world(bs.wo)
+            active &= mi.luminance(weight) > 0 if len(weight) == 3 else weight[0] > 0
+        ray = si.spawn_ray(direction)
+        dr.eval(si.p, normal, shading_normal, objects, keep, ray, active)
+
+        index = keep.numpy()
+        parts.append(
+            SurfacePoints(
+                si.p.numpy().T[index],
+                normal.numpy().T[index],
+                shading_normal.numpy().T[index],
+                objects.numpy()[index],
+                np.full(int(index.sum()), float(bounce), dtype=np.float32),
+            )
+        )
+    return parts

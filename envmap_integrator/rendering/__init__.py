@@ -1,0 +1,1 @@
+"""Stage 3: light transport that traces near, looks up far, and ends in the irradiance cache."""

@@ -1,0 +1,276 @@
+"""The one light transport loop that all integrators, the bake and the radiosity pass record.
+
+A path starts anywhere, follows specular surfaces in full, and ends at the first opportunity: in
+the irradiance cache at a surface the cache serves, or in the map of the cube it leaves. What
+differs between the algorithms of the paper (its section 3) is only ``gather_depth`` and whether
+there are maps:
+
+======================  ============  ====
+algorithm               gather_depth  maps
+======================  ============  ====
+``envmap_hybrid``       1             yes
+``one_level_path``      1             no
+``source_selection``    0             no
+``envmap_bake``         0             no
+======================  ============  ====
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..maps.far_field import FarField
+from ..radiosity.irradiance import IrradianceCache
+from ..radiosity.patches import Patches
+from ..radiosity.surface_points import ObjectIds
+
+#: Directions sampled more densely than this [1/sr] belong to a lobe for which a Lambertian
+#: stand-in would misplace the light: they are traced on instead of read from the cache.
+#: (A cosine lobe has 0.32 at most.)
+NARROW_PDF = 1.0
+#: Bounces before Russian roulette may end a path that neither cache nor map has ended.
+RR_DEPTH = 6
+
+
+@dataclass(frozen=True)
+class Transport:
+    """What a path may use, and how far it goes before it uses it.
+
+    patches          the coarse mesh
+    object_ids       dense ids of the shapes of the scene at hand
+    far_field        maps of the clusters, or None to trace every ray in full
+    gather_depth     non-specular bounces before the cache may end the path
+    shadow_rays      direct light by shadow rays also where the cache could give it
+    emission         whether sources count where the first ray hits them
+    hide_emitters    sources seen by camera rays are left out, as in Mitsuba
+    """
+
+    patches: Patches
+    object_ids: ObjectIds
+    far_field: FarField | None = None
+    gather_depth: int = 1
+    shadow_rays: bool = False
+    emission: bool = True
+    hide_emitters: bool = False
+
+
+@dataclass
+class PathState:
+    """Where a path starts.
+
+    ray             its first ray
+    depth           non-specular bounces behind it
+    origin          the vertex it comes from, for the MIS weight of the sources it hits
+    pdf, specular   density [1/sr] with which the direction was sampled; no density if specular
+    bounded         whether ``ray.maxt`` ends it at the cube ``cluster``
+    """
+
+    ray: mi.Ray3f
+    depth: mi.UInt32
+    origin: mi.Interaction3f
+    pdf: mi.Float
+    specular: mi.Bool
+    bounded: mi.Bool
+    cluster: mi.UInt32
+
+
+@dataclass
+class PathEnd:
+    """What a path found: ``radiance + weight * E[row] / pi`` is the light it brings.
+
+    radiance   [W/m²/sr]  from sources and maps
+    direct     [W/m²/sr]  the part of it that came from sources on the first ray
+    weight     [1]        throughput times albedo at the patch the path ended in, 0 if none
+    row        [1]        row of the irradiance table (2 * patch, + 1 for indirect light only)
+    valid                 whether something was hit (alpha)
+    distance   [m]        to the first hit, infinite if none
+    """
+
+    radiance: mi.Spectrum
+    direct: mi.Spectrum
+    weight: mi.Spectrum
+    row: mi.UInt32
+    valid: mi.Bool
+    distance: mi.Float
+
+
+def mis_weight(pdf_a, pdf_b):
+    """Power heuristic."""
+    a2 = dr.square(pdf_a)
+    weight = a2 / dr.fma(pdf_b, pdf_b, a2)
+    return dr.detach(dr.select(dr.isfinite(weight), weight, 0))
+
+
+@dr.syntax
+def follow(
+    scene: mi.Scene, transport: Transport, sampler: mi.Sampler, start: PathState, active: mi.Bool
+) -> PathEnd:
+    """Follow paths from ``start`` until the cache or a map ends them, or nothing is left to find.
+
+    Every source is counted exactly once: by shadow rays and by the rays that hit it, weighted by
+    multiple importance sampling where both could, and never where the cache's total irradiance
+    ends the path, which has counted it already.
+    """
+    ctx = mi.BSDFContext()
+    patches = transport.patches
+    far_field = transport.far_field
+    hide_emitters = transport.hide_emitters
+
+    # ---------------------- Loop state ----------------------
+
+    ray = mi.Ray3f(start.ray)
+    depth = mi.UInt32(start.depth)  # Non-specular bounces so far
+    bounces = mi.UInt32(0)  # All bounces of this call
+    origin = mi.Interaction3f(start.origin)  # Previous vertex,
+    pdf = mi.Float(start.pdf)  # ... density of the direction sampled there,
+    specular = mi.Bool(start.specular)  # ... whether sources weren't sampled for it
+    bounded = mi.Bool(start.bounded)  # Does the ray end where it leaves its cube?
+    cluster = mi.UInt32(start.cluster)
+    throughput = mi.Spectrum(1)
+    eta = mi.Float(1)
+    radiance = mi.Spectrum(0)
+    direct = mi.Spectrum(0)
+    weight = mi.Spectrum(0)
+    row = mi.UInt32(0)
+    valid = mi.Bool(False)
+    distance = mi.Float(dr.inf)
+    active = mi.Bool(active)
+
+    while dr.hint(
+        active, exclude=[transport, patches, far_field], label="Trace near, look up far"
+    ):
+        # ---------------------- Trace near ----------------------
+
+        pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+        if dr.hint(hide_emitters, mode="scalar"):
+            pi = skip_sources(scene, ray, pi, active & (bounces == 0))
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+        hit = active & si.is_valid()
+        distance = dr.select((bounces == 0) & hit, si.t, distance)
+
+        # ---------------------- Look up far ----------------------
+
+        retrace = mi.Bool(False)
+        source_si = si
+        source_active = mi.Bool(active)
+        if dr.hint(far_field is not None, mode="scalar"):
+            left = active & bounded & ~si.is_valid()
+            far_radiance, trusted = far_field.eval(
+                cluster, ray.o, ray.d, pdf, specular, sampler.next_1d(), sampler.next_2d(), left
+            )
+            looked_up = left & trusted
+            retrace = left & ~trusted
+            radiance[looked_up] += throughput * far_radiance
+            beyond = mi.Ray3f(ray(ray.maxt), ray.d)
+            source_si, source_visible = far_field.intersect_sources(scene, beyond, looked_up)
+            source_si = dr.select(looked_up, source_si, si)
+            source_active &= ~retrace & (~looked_up | source_visible)
+
+        # ---------------------- Sources hit ----------------------
+
+        if dr.hint(hide_emitters, mode="scalar"):
+            source_active &= bounces > 0
+        if dr.hint(not transport.emission, mode="scalar"):
+            source_active &= bounces > 0
+        ds = mi.DirectionSample3f(scene, si=source_si, ref=origin)
+        source_pdf = scene.pdf_emitter_direction(origin, ds, source_active & ~specular)
+        mis = dr.select(specular, 1, mis_weight(pdf, source_pdf))
+        emitted = throughput * mis * ds.emitter.eval(source_si, source_active)
+        radiance += emitted
+        direct[bounces == 0] = emitted
+
+        # ---------------------- Patch at the hit ----------------------
+
+        bsdf = si.bsdf(ray)
+        flags = bsdf.flags()
+        smooth = hit & mi.has_flag(flags, mi.BSDFFlags.Smooth)
+        normal = dr.select(dr.dot(si.n, ray.d) > 0, -si.n, si.n)
+        patch, size, found = patches.find_jittered(
+            si.p, normal, transport.object_ids(si), sampler.next_2d(), smooth
+        )
+        # A coarse mesh can't serve hits about as near as its patches are large (corners,
+        # contacts). The threshold is random, so that no border shows.
+        near = (bounces > 0) & (dr.norm(si.p - origin.p) < size * (0.5 + sampler.next_1d()))
+        served = found & ~near & (depth >= transport.gather_depth)
+        # Total irradiance stands for direct light too, but only under diffuse lobes.
+        lit_by_cache = served & (depth > 0) & ~mi.has_flag(flags, mi.BSDFFlags.Glossy)
+        if dr.hint(transport.shadow_rays, mode="scalar"):
+            lit_by_cache = mi.Bool(False)
+
+        # ---------------------- Direct light ----------------------
+
+        active_em = smooth & ~lit_by_cache
+        ds, em_weight = scene.sample_emitter_direction(si, sampler.next_2d(), True, active_em)
+        active_em &= ds.pdf != 0
+        wo = si.to_local(ds.d)
+        bsdf_value, bsdf_pdf, bs, bsdf_weight = bsdf.eval_pdf_sample(
+            ctx, si, wo, sampler.next_1d(), sampler.next_2d(), hit
+        )
+        # Directions that the cache answers are never traced: shadow rays count them alone.
+        partner_pdf = dr.select(served & is_wide(si, wo, bsdf_pdf), 0, bsdf_pdf)
+        mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, partner_pdf))
+        radiance[active_em] += throughput * bsdf_value * em_weight * mis
+
+        # ---------------------- End in the cache ----------------------
+
+        throughput *= bsdf_weight
+        eta *= bs.eta
+        valid |= hit & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+        sampled_specular = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        ends = served & ~sampled_specular & is_wide(si, bs.wo, bs.pdf)
+        weight[ends] = throughput
+        row[ends] = 2 * patch + dr.select(lit_by_cache, mi.UInt32(0), mi.UInt32(1))
+
+        # ---------------------- Next ray ----------------------
+
+        # ``retrace`` lanes repeat this segment from where it left the cube.
+        next_ray = si.spawn_ray(si.to_world(bs.wo))
+        ray = dr.select(retrace, mi.Ray3f(ray(ray.maxt), ray.d), next_ray)
+        ray.maxt = dr.largest(mi.Float)
+        pdf = dr.select(retrace, pdf, bs.pdf)
+        specular = dr.select(retrace, specular, sampled_specular | lit_by_cache)
+        origin = dr.select(retrace, origin, mi.Interaction3f(si))
+        depth += dr.select(hit & ~sampled_specular, mi.UInt32(1), mi.UInt32(0))
+        if dr.hint(far_field is not None, mode="scalar"):
+            cluster, bounded, maxt = far_field.bound(
+                patch, ray, pdf, sampled_specular, sampler.next_1d(), found & ~retrace
+            )
+            ray.maxt = maxt
+        active &= retrace | (hit & ~ends & (dr.max(throughput) != 0))
+
+        # ---------------------- Russian roulette ----------------------
+
+        bounces += 1
+        survival = dr.minimum(dr.max(throughput) * dr.square(eta), 0.95)
+        roulette = active & (bounces >= RR_DEPTH)
+        active &= ~roulette | (sampler.next_1d() < survival)
+        throughput[roulette] *= dr.rcp(survival)
+
+    return PathEnd(radiance, direct, weight, row, valid, distance)
+
+
+def is_wide(si, wo, pdf):
+    """Is light from ``wo`` reflected by a lobe so wide that cached irradiance may stand for it?
+
+    The cache holds the side that the path arrived on: transmission never qualifies.
+    """
+    return (pdf <= NARROW_PDF) & (mi.Frame3f.cos_theta(si.wi) * mi.Frame3f.cos_theta(wo) > 0)
+
+
+@dr.syntax
+def skip_sources(scene, ray, pi, active):
+    """Where an intersection lies on an area emitter, look behind it (``hide_emitters``)."""
+    ray = mi.Ray3f(ray)
+    pi = mi.PreliminaryIntersection3f(pi)
+    active = active & pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711
+    while dr.hint(active, label="Skip hidden sources"):
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
+        behind = si.spawn_ray(ray.d)
+        ray = dr.select(active, behind, ray)
+        pi_behind = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+        pi = dr.select(active, pi_behind, pi)
+        active &= pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711
+    return pi

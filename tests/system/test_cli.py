@@ -1,0 +1,189 @@
+"""``envmap-render`` from its arguments to its files, messages and exit codes."""
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import mitsuba as mi
+import numpy as np
+import OpenEXR
+import pytest
+
+from envmap_integrator.cli import main
+from envmap_integrator.cli.output import replacing
+from envmap_integrator.cli.scene_file import SceneFile
+
+SCENE = """
+<scene version="3.0.0">
+    <default name="radiance" value="1"/>
+    {integrator}
+    <sensor type="perspective">
+        <transform name="to_world"> <lookat origin="0,0,4" target="0,0,0" up="0,1,0"/> </transform>
+        <film type="hdrfilm">
+            <integer name="width" value="16"/> <integer name="height" value="12"/>
+            <integer name="crop_width" value="8"/>
+        </film>
+        <sampler type="independent"> <integer name="sample_count" value="4"/> </sampler>
+    </sensor>
+    <shape type="sphere"> <bsdf type="diffuse"/> </shape>
+    <emitter type="constant"> <float name="radiance" value="$radiance"/> </emitter>
+</scene>
+"""
+PATH = '<integrator type="path"> <integer name="max_depth" value="2"/> </integrator>'
+UNKNOWN = '<integrator type="no_such_plugin"> <float name="strange" value="1"/> </integrator>'
+
+
+@pytest.fixture
+def scene(tmp_path) -> Path:
+    return write_scene(tmp_path, PATH)
+
+
+def write_scene(folder: Path, integrator: str) -> Path:
+    path = folder / "ball.xml"
+    path.write_text(SCENE.format(integrator=integrator))
+    return path
+
+
+def pixels(path: Path) -> np.ndarray:
+    return np.array(mi.Bitmap(str(path)))
+
+
+def header(path: Path) -> dict:
+    with OpenEXR.File(str(path), header_only=True) as file:
+        return dict(file.header())  # which closing empties
+
+
+def run(*arguments: object) -> int:
+    return main([str(argument) for argument in arguments])
+
+
+def test_render_writes_picture_and_header(scene, capsys):
+    assert run("render", scene, "--spp", 2, "--seed", 3, "--png", "-D", "radiance=5") == 0
+    picture = scene.with_suffix(".exr")
+    assert pixels(picture).shape == (12, 8, 3)
+    assert pixels(picture)[0, 0] == pytest.approx(5)
+
+    settings = json.loads(header(picture)["settings"])
+    assert settings["integrator"] == "path"
+    assert "max_depth = 2" in settings["integrator_settings"]
+    assert (settings["spp"], settings["seed"]) == (2, 3)
+    assert settings["defines"] == {"radiance": "5"}
+    assert set(json.loads(header(picture)["stage_times"])) == {"load", "render"}
+
+    assert pixels(scene.with_suffix(".png")).dtype == np.uint8
+    assert sorted(path.suffix for path in scene.parent.iterdir()) == [".exr", ".png", ".xml"]
+    assert "render" in capsys.readouterr().out
+
+
+def test_integrator_of_the_scene_need_not_exist(tmp_path):
+    scene = write_scene(tmp_path, UNKNOWN)
+    output = tmp_path / "picture.exr"
+    options = ("--integrator", "direct", "--set", "hide_emitters=true", "--set", "bsdf_samples=2")
+    assert run("render", scene, "-o", output, *options) == 0
+    assert "bsdf_samples = 2" in json.loads(header(output)["settings"])["integrator_settings"]
+    assert pixels(output)[0, 0] == pytest.approx(0)
+
+
+def test_a_scene_without_integrator_gets_ours(tmp_path):
+    mi.set_variant("llvm_ad_rgb")
+    scene_file = SceneFile(write_scene(tmp_path, ""))
+    assert scene_file.integrator.plugin_name() == "envmap_hybrid"
+
+
+def test_films_can_be_resized(scene):
+    mi.set_variant("llvm_ad_rgb")
+    scene_file = SceneFile(scene)
+    scene_file.configure_films(6, 5)
+    first, second = scene_file.load(), scene_file.load()
+    film = first.sensors()[0].film()
+    assert tuple(film.crop_size()) == (6, 5)
+    assert film.rfilter().radius() == 0.5
+    assert first.integrator() is not second.integrator()
+
+
+@pytest.fixture
+def preparing_integrator():
+    """An integrator with a pre-pass, as ours have; its state saves itself as text."""
+    mi.set_variant("llvm_ad_rgb")
+
+    class Preparing(mi.SamplingIntegrator):
+        def prepare(self, scene):
+            return SimpleNamespace(
+                stage_times={"radiosity": 1.25}, save=lambda path: path.write_text("baked")
+            )
+
+        def sample(self, scene, sampler, ray, medium=None, active=True):
+            return mi.Spectrum(0.5), mi.Bool(True), []
+
+        def to_string(self):
+            return "Preparing[]"
+
+    mi.register_integrator("cli_test_preparing", Preparing)
+    return "cli_test_preparing"
+
+
+def test_stage_times_of_the_pre_pass_are_reported(scene, preparing_integrator, capsys):
+    assert run("render", scene, "--integrator", preparing_integrator) == 0
+    times = json.loads(header(scene.with_suffix(".exr"))["stage_times"])
+    assert times["radiosity"] == 1.25
+    assert "radiosity" in capsys.readouterr().out
+
+
+def test_bake_saves_the_state(scene, preparing_integrator, tmp_path):
+    output = tmp_path / "state.exr"
+    assert run("bake", scene, "-o", output, "--integrator", preparing_integrator) == 0
+    assert output.read_text() == "baked"
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path):
+    path = tmp_path / "picture.exr"
+    path.write_text("old")
+    with pytest.raises(OSError), replacing(path) as temporary:
+        temporary.write_text("half")
+        raise OSError
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("-m", "llvm_rgb"), 'unknown variant "llvm_rgb"'),
+        (("-D", "radiance"), 'expected KEY=VALUE, got "radiance"'),
+        (("-D", "radiant=3"), "remove -D radiant"),
+        (("--set", "max_dept=3"), "max_dept"),
+        (("--set", "max_depth=deep"), "give it as integer"),
+        (("--integrator", "no_such_plugin"), '"no_such_plugin" not found'),
+        (("-s", "1"), "-s/--sensor 1 is out of range"),
+        (("-t", "0"), "-t/--threads must be at least 1"),
+        (("--spp", "-1"), "--spp must not be negative"),
+        (("-o", "picture.png"), "must end in .exr"),
+        (("-o", "nowhere/picture.exr"), "does not exist"),
+    ],
+)
+def test_bad_input_gives_one_line_and_exit_code_2(scene, capsys, options, message):
+    try:
+        code = run("render", scene, *options)
+    except SystemExit as exit:
+        code = exit.code
+    error = capsys.readouterr().err
+    assert code == 2
+    assert message in error
+    assert error.count("\n") == 1
+    assert not scene.with_suffix(".exr").exists()
+
+
+def test_missing_scene(tmp_path, capsys):
+    assert run("render", tmp_path / "none.xml") == 2
+    assert "none.xml" in capsys.readouterr().err
+
+
+def test_bake_without_pre_pass(scene, tmp_path, capsys):
+    assert run("bake", scene, "-o", tmp_path / "state.exr") == 2
+    assert '"path" has nothing to bake' in capsys.readouterr().err
+
+
+def test_doctor_finds_this_machine_fit(capsys):
+    assert main(["doctor"]) == 0
+    report = capsys.readouterr().out
+    assert "libLLVM" in report and "llvm_ad_rgb" in report
