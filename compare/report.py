@@ -17,6 +17,9 @@ import envmap_integrator
 from compare.records import Experiment, Measurements, Result
 from envmap_integrator.cli.output import replacing
 
+WIDTH = 100
+"""Of the table where no terminal sets it [characters]."""
+
 
 def print_table(experiment: Experiment, results: list[Result]) -> None:
     """Print one row an integrator and, where ``path`` takes part, the speed-ups against it."""
@@ -38,6 +41,8 @@ def print_table(experiment: Experiment, results: list[Result]) -> None:
             f"{100 * result.bias.value:+.2f} ± {100 * result.bias.margin:.2f}",
         )
     console = Console()
+    if not console.is_terminal:
+        console = Console(width=WIDTH)
     console.print(table)
     path = next((result for result in results if result.integrator == "path"), None)
     for result in results:

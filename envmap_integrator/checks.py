@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 
 from .llvm import ensure_llvm
@@ -22,23 +23,40 @@ def check_variant(plugin: str) -> None:
 
 
 def check_scene(scene: mi.Scene, owner: str) -> None:
-    """Raise ``ValueError`` for scenes without surfaces or emitters, and with participating media."""
-    shapes = scene.shapes()
-    if not shapes:
+    """Stop at scenes that would render black or wrong.
+
+    Raises ``ValueError`` for scenes without surfaces or emitters and for participating media.
+    Media that only absorb, as in tinted glass, are ignored with a warning: ``path``, the reference,
+    ignores all media.
+    """
+    if not scene.shapes():
         raise ValueError(f"{owner}: the scene has no surfaces; add a shape")
     if not scene.emitters():
         raise ValueError(f"{owner}: the scene has no emitters, all would be black; add one")
-    for shape in shapes:
-        for name in ("interior_medium", "exterior_medium"):
-            medium = getattr(shape, name)()
-            if medium is not None:
+    for shape in scene.shapes():
+        for name in ("interior", "exterior"):
+            medium = getattr(shape, f"{name}_medium")()
+            if medium is None:
+                continue
+            if _scatters(medium):
                 raise ValueError(
-                    f'{owner}: shape "{shape.id()}" has participating media ("{medium.id()}" as '
-                    f'"{name}"), which aren\'t supported; remove it or use volpath'
+                    f'{owner}: shape "{shape.id()}" has a participating medium ({medium.class_name()}'
+                    f' as "{name}"), which isn\'t supported; remove it or use volpath'
                 )
+            mi.Log(
+                mi.LogLevel.Warn,
+                f'{owner}: the absorbing medium ("{name}") of shape "{shape.id()}" is ignored, '
+                "as path does; use volpath to see it",
+            )
     for sensor in scene.sensors():
         if sensor.get_medium() is not None:
             raise ValueError(
-                f'{owner}: sensor "{sensor.id()}" lies in a medium, which isn\'t supported; '
-                "remove it or use volpath"
+                f'{owner}: sensor "{sensor.id()}" lies in a participating medium, which isn\'t '
+                "supported; remove it or use volpath"
             )
+
+
+def _scatters(medium: mi.Medium) -> bool:
+    """Whether the single scattering albedo may be above zero anywhere."""
+    albedos = [value for key, value in mi.traverse(medium) if key.startswith("albedo")]
+    return not albedos or any(dr.max(dr.ravel(value))[0] > 0 for value in albedos)

@@ -1,12 +1,4 @@
-"""A progress bar for the stages that make the user wait, and nothing for those that don't.
-
-.. code-block:: python
-
-    with stage("radiosity", total=patch_count) as advance:
-        for batch in batches:
-            ...
-            advance(len(batch))
-"""
+"""A progress bar for the stages that make the user wait, and nothing for those that don't."""
 
 from __future__ import annotations
 
@@ -29,7 +21,7 @@ _display: Progress | None = None
 
 @contextmanager
 def stage(name: str, total: float | None = None) -> Iterator[Callable[[float], None]]:
-    """Show a bar for the block on stderr once it has lasted :data:`DELAY` seconds.
+    """Show a bar on stderr once the block has lasted :data:`DELAY` seconds: ``with stage(...)``.
 
     Yields ``advance(steps)``. A bar without ``total`` only shows that work goes on. Bars appear on
     terminals only, or with the environment variable ``ENVMAP_PROGRESS=1``. Stages may nest.

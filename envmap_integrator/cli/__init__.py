@@ -48,12 +48,14 @@ def build_parser() -> argparse.ArgumentParser:
 
     render = subparsers.add_parser("render", help="render a scene to an OpenEXR file")
     _add_scene_options(render)
-    render.add_argument("-s", "--sensor", type=int, default=0, metavar="INDEX")
+    render.add_argument(
+        "-s", "--sensor", type=int, default=0, metavar="INDEX", help="in the scene's order, from 0"
+    )
     render.add_argument("-o", "--output", type=Path, help="default: beside the scene, .exr")
     render.add_argument(
         "--spp", type=int, default=0, help="samples per pixel, default: the scene's"
     )
-    render.add_argument("--seed", type=int, default=0)
+    render.add_argument("--seed", type=int, default=0, help="of the sampler")
     render.add_argument("--png", action="store_true", help="also write an sRGB PNG beside the EXR")
     render.set_defaults(command=commands.render)
 
@@ -70,7 +72,9 @@ def build_parser() -> argparse.ArgumentParser:
 
 def _add_scene_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", type=Path, metavar="SCENE.xml")
-    parser.add_argument("-m", "--mode", default="llvm_ad_rgb", metavar="VARIANT")
+    parser.add_argument(
+        "-m", "--mode", default="llvm_ad_rgb", metavar="VARIANT", help="default: %(default)s"
+    )
     parser.add_argument("-t", "--threads", type=int, help="default: one per core")
     parser.add_argument(
         "-D", "--define", type=parse_assignment, action="append", default=[], metavar="KEY=VALUE",

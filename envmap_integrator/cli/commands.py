@@ -28,6 +28,7 @@ def render(args: argparse.Namespace) -> int:
     with record_kernels():
         scene_file, scene = _load(args, seconds)
         sensor = _sensor(scene, args.sensor)
+        settings = _settings(args, scene_file, scene, sensor)
         if hasattr(scene.integrator(), "prepare"):
             seconds |= scene.integrator().prepare(scene).stage_times
         with measure(seconds, "render"):
@@ -35,16 +36,6 @@ def render(args: argparse.Namespace) -> int:
         compilation = compilation_time()
 
     bitmap = sensor.film().bitmap()
-    settings = {
-        "scene": str(args.scene),
-        "defines": dict(args.define),
-        "variant": args.mode,
-        "sensor": args.sensor,
-        "spp": args.spp or sensor.sampler().sample_count(),
-        "seed": args.seed,
-        "integrator": scene_file.integrator.plugin_name(),
-        "integrator_settings": str(scene.integrator()),
-    }
     metadata = bitmap.metadata()
     metadata["envmap_integrator"] = envmap_integrator.__version__
     metadata["settings"] = json.dumps(settings)
@@ -109,6 +100,22 @@ def _sensor(scene: mi.Scene, index: int) -> mi.Sensor:
         f"-s/--sensor {index} is out of range: the scene has {len(sensors)} sensor(s)",
     )
     return sensors[index]
+
+
+def _settings(
+    args: argparse.Namespace, scene_file: SceneFile, scene: mi.Scene, sensor: mi.Sensor
+) -> dict[str, object]:
+    """Everything needed to repeat the picture, defaults resolved."""
+    return {
+        "scene": str(args.scene),
+        "defines": dict(args.define),
+        "variant": args.mode,
+        "sensor": args.sensor,
+        "spp": args.spp or sensor.sampler().sample_count(),
+        "seed": args.seed,
+        "integrator": scene_file.integrator.plugin_name(),
+        "integrator_settings": str(scene.integrator()),
+    }
 
 
 def _check_output(path: Path) -> None:

@@ -12,6 +12,7 @@ _MENDS = (
     (re.compile(r"undefined parameter: \$(\w+)"), r"pass -D \1=VALUE"),
     (re.compile(r"unused parameters?: - \$(\w+)"), r"the scene has no $\1; remove -D \1"),
     (re.compile(r"wrong type \(expected (\w+)"), r"give it as \1"),
+    (re.compile(r"CUDA backend"), "no usable NVIDIA GPU here; pass -m llvm_ad_rgb"),
     (re.compile(r"file not found|does not exist"), "check the path"),
 )
 

@@ -88,15 +88,13 @@ class CachedIntegrator(mi.SamplingIntegrator):
         return radiance, valid, []
 
     def radiance(self, scene, prepared, sampler, ray, active):
-        """Radiance [W/m²/sr] along rays, distance to the first hit, whether there was one."""
-        end = camera_radiance(
+        """As ``camera_radiance``, from a prepared state that need hold no more than the cache."""
+        return camera_radiance(
             scene,
             self.transport(scene, prepared, sampler.sample_count()),
+            prepared.cache,
             sampler,
             mi.Ray3f(ray),
             mi.Bool(active),
-            self.shadow_samples,
             self.secondary_samples,
         )
-        cached = end.weight * prepared.cache.irradiance(end.row) * dr.inv_pi
-        return end.radiance + cached, end.distance, end.valid

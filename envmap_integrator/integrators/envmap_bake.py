@@ -46,7 +46,11 @@ class EnvmapBake(CachedIntegrator):
 
     def transport(self, scene, prepared, spp):
         return Transport(
-            prepared.cache.patches, self.object_ids(scene), gather_depth=0, emission=False
+            prepared.cache.patches,
+            self.object_ids(scene),
+            gather_depth=0,
+            shadow_samples=self.shadow_samples,
+            emission=False,
         )
 
     def aov_names(self):

@@ -138,6 +138,7 @@ class EnvmapHybrid(CachedIntegrator):
             self.object_ids(scene),
             far_field=self._far_field_of(scene, prepared, spp),
             gather_depth=self.gather_depth,
+            shadow_samples=self.shadow_samples,
             shadow_rays=self.second_hit == "shadow_rays",
             hide_emitters=self.hide_emitters,
         )

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import mitsuba as mi
+
+from ..parameters import Parameters
 from ..rendering.transport import Transport
 from .common import CachedIntegrator
 
@@ -24,15 +27,24 @@ class OneLevelPath(CachedIntegrator):
      * - shadow_samples
        - |int|
        - Shadow rays at a camera hit. (Default: 1)
+     * - secondary_samples
+       - |int|
+       - Secondary rays at a camera hit. (Default: 1)
      * - hide_emitters
        - |bool|
        - Hide directly visible emitters. (Default: false)
     """
+
+    def __init__(self, props: mi.Properties):
+        super().__init__(props)
+        parameters = Parameters(props)
+        self.secondary_samples = parameters.integer("secondary_samples", 1, 1, 1 << 16)
 
     def transport(self, scene, prepared, spp):
         return Transport(
             prepared.cache.patches,
             self.object_ids(scene),
             gather_depth=1,
+            shadow_samples=self.shadow_samples,
             hide_emitters=self.hide_emitters,
         )

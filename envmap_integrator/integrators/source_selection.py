@@ -34,5 +34,6 @@ class SourceSelection(CachedIntegrator):
             prepared.cache.patches,
             self.object_ids(scene),
             gather_depth=0,
+            shadow_samples=self.shadow_samples,
             hide_emitters=self.hide_emitters,
         )

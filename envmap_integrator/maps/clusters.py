@@ -10,7 +10,7 @@ from scipy.cluster.hierarchy import fcluster, linkage
 from ..radiosity.surface_points import SurfacePoints
 
 #: Objects larger than this fraction of the scene are surroundings (floors, walls), not contents.
-LARGEST_OBJECT = 0.2
+LARGEST_OBJECT = 0.25
 #: Objects nearer to each other than this fraction of the scene may share a cluster.
 REACH = 0.3
 #: A cluster seen by less than this fraction of the sensors' rays isn't worth a map.

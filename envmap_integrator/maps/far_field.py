@@ -176,8 +176,14 @@ def far_field(
 
 def _source_scene(scene: mi.Scene) -> mi.Scene | None:
     """A scene of the emitters' shapes alone."""
-    shapes = {f"shape{i}": s for i, s in enumerate(scene.shapes()) if s.is_emitter()}
-    return mi.load_dict({"type": "scene", **shapes}) if shapes else None
+    shapes = [shape for shape in scene.shapes() if shape.is_emitter()]
+    if not shapes:
+        return None
+    ids = [shape.id() for shape in shapes]
+    sources = mi.load_dict({"type": "scene"} | {f"shape{i}": s for i, s in enumerate(shapes)})
+    for shape, id_ in zip(shapes, ids, strict=True):  # Loading has renamed them.
+        shape.set_id(id_)
+    return sources
 
 
 def texel_type():

@@ -43,6 +43,7 @@ class Transport:
     object_ids       dense ids of the shapes of the scene at hand
     far_field        maps of the clusters, or None to trace every ray in full
     gather_depth     non-specular bounces before the cache may end the path
+    shadow_samples   shadow rays at a camera hit; further on it's one
     shadow_rays      direct light by shadow rays also where the cache could give it
     emission         whether sources count where the first ray hits them
     hide_emitters    sources seen by camera rays are left out, as in Mitsuba
@@ -52,6 +53,7 @@ class Transport:
     object_ids: ObjectIds
     far_field: FarField | None = None
     gather_depth: int = 1
+    shadow_samples: int = 1
     shadow_rays: bool = False
     emission: bool = True
     hide_emitters: bool = False
@@ -104,6 +106,19 @@ def mis_weight(pdf_a, pdf_b):
     return dr.detach(dr.select(dr.isfinite(weight), weight, 0))
 
 
+def camera_path(ray: mi.Ray3f) -> PathState:
+    """A path that starts at a sensor."""
+    return PathState(
+        ray=ray,
+        depth=mi.UInt32(0),
+        origin=dr.zeros(mi.Interaction3f),
+        pdf=mi.Float(1),
+        specular=mi.Bool(True),
+        bounded=mi.Bool(False),
+        cluster=mi.UInt32(0),
+    )
+
+
 @dr.syntax
 def follow(
     scene: mi.Scene, transport: Transport, sampler: mi.Sampler, start: PathState, active: mi.Bool
@@ -135,7 +150,8 @@ def follow(
     direct = mi.Spectrum(0)
     weight = mi.Spectrum(0)
     row = mi.UInt32(0)
-    valid = mi.Bool(False)
+    # As in path, a visible environment is never transparent.
+    valid = active & (scene.environment() is not None and not hide_emitters)
     distance = mi.Float(dr.inf)
     active = mi.Bool(active)
 
@@ -182,40 +198,28 @@ def follow(
         radiance += emitted
         direct[bounces == 0] = emitted
 
-        # ---------------------- Patch at the hit ----------------------
+        # ---------------------- Direct light ----------------------
 
         bsdf = si.bsdf(ray)
-        flags = bsdf.flags()
-        smooth = hit & mi.has_flag(flags, mi.BSDFFlags.Smooth)
-        normal = dr.select(dr.dot(si.n, ray.d) > 0, -si.n, si.n)
-        patch, size, found = patches.find_jittered(
-            si.p, normal, transport.object_ids(si), sampler.next_2d(), smooth
-        )
+        smooth = hit & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        patch, size, found = find_patch(transport, si, ray, sampler.next_2d(), smooth)
         # A coarse mesh can't serve hits about as near as its patches are large (corners,
         # contacts). The threshold is random, so that no border shows.
         near = (bounces > 0) & (dr.norm(si.p - origin.p) < size * (0.5 + sampler.next_1d()))
         served = found & ~near & (depth >= transport.gather_depth)
         # Total irradiance stands for direct light too, but only under diffuse lobes.
-        lit_by_cache = served & (depth > 0) & ~mi.has_flag(flags, mi.BSDFFlags.Glossy)
+        lit_by_cache = served & (depth > 0) & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy)
         if dr.hint(transport.shadow_rays, mode="scalar"):
             lit_by_cache = mi.Bool(False)
-
-        # ---------------------- Direct light ----------------------
-
-        active_em = smooth & ~lit_by_cache
-        ds, em_weight = scene.sample_emitter_direction(si, sampler.next_2d(), True, active_em)
-        active_em &= ds.pdf != 0
-        wo = si.to_local(ds.d)
-        bsdf_value, bsdf_pdf, bs, bsdf_weight = bsdf.eval_pdf_sample(
-            ctx, si, wo, sampler.next_1d(), sampler.next_2d(), hit
-        )
-        # Directions that the cache answers are never traced: shadow rays count them alone.
-        partner_pdf = dr.select(served & is_wide(si, wo, bsdf_pdf), 0, bsdf_pdf)
-        mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, partner_pdf))
-        radiance[active_em] += throughput * bsdf_value * em_weight * mis
+        n_shadow = dr.select(depth == 0, mi.UInt32(transport.shadow_samples), mi.UInt32(1))
+        radiance += throughput * sample_sources(
+            scene, si, bsdf, sampler, n_shadow, transport.shadow_samples > 1, served,
+            smooth & ~lit_by_cache,
+        )  # fmt: skip
 
         # ---------------------- End in the cache ----------------------
 
+        bs, bsdf_weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), hit)
         throughput *= bsdf_weight
         eta *= bs.eta
         valid |= hit & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
@@ -250,6 +254,49 @@ def follow(
         throughput[roulette] *= dr.rcp(survival)
 
     return PathEnd(radiance, direct, weight, row, valid, distance)
+
+
+def find_patch(transport, si, ray, u, active):
+    """Patch on the side of a surface that a ray hits: ``(patch, size, found)``."""
+    normal = dr.select(dr.dot(si.n, ray.d) > 0, -si.n, si.n)
+    return transport.patches.find_jittered(
+        si.p, normal, transport.object_ids(si), u, active
+    )
+
+
+@dr.syntax
+def sample_sources(scene, si, bsdf, sampler, count, several, served, active):
+    """Direct light [W/m²/sr] reflected at a surface, by ``count`` stratified shadow rays a lane.
+
+    ``several`` tells whether any count exceeds one. Where the cache serves the surface
+    (``served``), directions under wide lobes are never traced: there shadow rays count alone.
+    """
+    ctx = mi.BSDFContext()
+    result = mi.Spectrum(0)
+    i = mi.UInt32(0)
+    active = mi.Bool(active)
+    if dr.hint(several, mode="scalar"):
+        while dr.hint(active, exclude=[bsdf], label="Shadow rays"):
+            u = sampler.next_2d()
+            u.x = (u.x + mi.Float(i)) / mi.Float(count)
+            result += sample_source(scene, ctx, si, bsdf, u, served, active)
+            i += 1
+            active &= i < count
+        result /= mi.Float(count)
+    else:
+        result = sample_source(scene, ctx, si, bsdf, sampler.next_2d(), served, active)
+    return result
+
+
+def sample_source(scene, ctx, si, bsdf, u, served, active):
+    """One term of ``sample_sources``."""
+    ds, em_weight = scene.sample_emitter_direction(si, u, True, active)
+    active = active & (ds.pdf != 0)
+    wo = si.to_local(ds.d)
+    bsdf_value, bsdf_pdf = bsdf.eval_pdf(ctx, si, wo, active)
+    partner_pdf = dr.select(served & is_wide(si, wo, bsdf_pdf), 0, bsdf_pdf)
+    mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, partner_pdf))
+    return dr.select(active, bsdf_value * em_weight * mis, 0)
 
 
 def is_wide(si, wo, pdf):
