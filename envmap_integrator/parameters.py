@@ -1,4 +1,4 @@
-"""Validated access to plugin parameters: Mitsuba's own ``props.get`` checks neither type nor range."""
+"""Validated access to plugin parameters: ``props.get`` checks neither type nor range."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Parameters:
     def number(
         self, name: str, default: float | None, low: float, high: float = math.inf
     ) -> float | None:
-        if default is None and not self._props.has_property(name):
+        if default is None and name not in self._props:
             return None
         value = self._props.get(name, default)
         if isinstance(value, bool) or not isinstance(value, int | float):
@@ -59,7 +59,7 @@ class Parameters:
         return value
 
     def _in_range(self, name, value, low, high):
-        if not low <= value <= high:
-            upper = f" and at most {high:g}" if math.isfinite(high) else ""
+        if not (low <= value <= high and math.isfinite(value)):
+            upper = f" and at most {high:.10g}" if math.isfinite(high) else ""
             raise ValueError(f'{self.owner}: "{name}" must be at least {low:g}{upper}, not {value}')
         return value

@@ -12,9 +12,8 @@ import numpy as np
 
 from .jit import opaque_point
 from .maps.clusters import (
-    Cluster,
     ClusterRequest,
-    cluster_of_patch,
+    cluster_of_cell,
     find_clusters,
     listed_clusters,
 )
@@ -49,14 +48,14 @@ class Prepared:
     key                content hash of the scene, and the settings
     cache              irradiance on the patches
     maps               one cube map per cluster
-    cluster_of_patch   [P] cluster index, ``len(maps)`` where there is none
+    cluster_of_cell    cluster index of each large cell, ``len(maps)`` where there is none
     stage_times        seconds spent in each stage
     """
 
     key: str
     cache: IrradianceCache
     maps: tuple[CubeMap, ...] = ()
-    cluster_of_patch: np.ndarray | None = None
+    cluster_of_cell: np.ndarray | None = None
     stage_times: dict[str, float] = field(default_factory=dict)
 
     def save(self, path) -> None:
@@ -71,7 +70,7 @@ def prepare(scene: mi.Scene, key: str, settings: Settings, baker=None) -> Prepar
     with _timed(times, "coarse mesh"):
         object_ids = ObjectIds(scene)
         points = scatter_points(scene, object_ids, POINTS_PER_PATCH * settings.patches)
-        patches, patch_of_point = build_patches(points, object_ids, settings.patches)
+        patches, patch_of_point, cell_of_point = build_patches(points, object_ids, settings.patches)
 
     with _timed(times, "irradiance cache"):
         cache = solve_irradiance(
@@ -83,22 +82,28 @@ def prepare(scene: mi.Scene, key: str, settings: Settings, baker=None) -> Prepar
 
     with _timed(times, "clusters"):
         if settings.requests:
-            clusters = listed_clusters(points, scene, settings.requests, settings.distance_ratio)
+            clusters, cluster_of_point = listed_clusters(
+                points, scene, settings.requests, settings.distance_ratio
+            )
         else:
-            clusters = find_clusters(points, settings.distance_ratio)
-        membership = cluster_of_patch(clusters, points, patch_of_point, patches.count)
+            clusters, cluster_of_point = find_clusters(points, settings.distance_ratio)
+        membership = cluster_of_cell(
+            len(clusters), cluster_of_point, cell_of_point, dr.width(patches.levels)
+        )
 
     with _timed(times, "maps"):
         maps = tuple(
-            _bake(scene, prepared, baker, cluster, points, settings.map_resolution, seed)
-            for seed, cluster in enumerate(clusters, start=1)
+            baker.bake(
+                scene,
+                prepared,
+                cluster,
+                points.take(np.flatnonzero(cluster_of_point == index)),
+                settings.map_resolution,
+                seed=index + 1,
+            )
+            for index, cluster in enumerate(clusters)
         )
-    return replace(prepared, maps=maps, cluster_of_patch=membership)
-
-
-def _bake(scene, prepared, baker, cluster: Cluster, points, resolution, seed) -> CubeMap:
-    members = points.take(np.flatnonzero(np.isin(points.object_id, cluster.objects)))
-    return baker.bake(scene, prepared, cluster, members, resolution, seed)
+    return replace(prepared, maps=maps, cluster_of_cell=membership)
 
 
 @contextmanager
@@ -119,11 +124,12 @@ def save(path, prepared: Prepared) -> None:
     """Write a prepared state to an OpenEXR file."""
     patches = prepared.cache.patches
     parts = {
-        "patch_table": {"entry": _image(patches.table.numpy())},
+        "patches": {"fingerprint": _image(patches.cells.numpy())},
+        "levels": {"entry": _image(patches.levels.numpy())},
         "irradiance": {"Y": _image(prepared.cache.table.numpy())},
     }
-    if prepared.cluster_of_patch is not None:
-        parts["cluster_of_patch"] = {"cluster": _image(prepared.cluster_of_patch)}
+    if prepared.cluster_of_cell is not None:
+        parts["cluster_of_cell"] = {"cluster": _image(prepared.cluster_of_cell)}
     maps = []
     for index, cube_map in enumerate(prepared.maps):
         map_parts, map_metadata = to_parts(cube_map, prefix=f"map{index}/")
@@ -133,9 +139,9 @@ def save(path, prepared: Prepared) -> None:
         "key": prepared.key,
         "origin": [float(c[0]) for c in patches.origin],
         "size": float(patches.size[0]),
-        "table_size": dr.width(patches.table),
-        "use_objects": patches.use_objects,
+        "levels": dr.width(patches.levels),
         "patches": patches.count,
+        "use_objects": patches.use_objects,
         "channels": len(mi.Spectrum()),
         "maps": maps,
         "stage_times": prepared.stage_times,
@@ -161,23 +167,23 @@ def load(path, key: str, owner: str) -> Prepared:
         raise ValueError(f'{owner}: "cache_file" {error}') from None
 
     n_patches = metadata["patches"]
-    table = parts["patch_table"]["entry"].ravel()[: metadata["table_size"]]
-    irradiance = parts["irradiance"]["Y"].ravel()[: 2 * n_patches * metadata["channels"]]
-    clusters = parts.get("cluster_of_patch")
+
+    def values(part, channel, n):
+        return parts[part][channel].ravel()[:n]
+
     patches = Patches(
         origin=opaque_point(metadata["origin"]),
         size=dr.opaque(mi.Float, metadata["size"]),
-        table=mi.UInt32(table),
-        mask=dr.opaque(mi.UInt32, len(table) // 2 - 1),
+        levels=mi.UInt32(values("levels", "entry", metadata["levels"])),
+        cells=mi.UInt32(values("patches", "fingerprint", n_patches)),
         use_objects=metadata["use_objects"],
-        count=n_patches,
     )
+    table = mi.Float(values("irradiance", "Y", 2 * n_patches * metadata["channels"]))
+    membership = None
+    if "cluster_of_cell" in parts:
+        membership = values("cluster_of_cell", "cluster", metadata["levels"])
     return Prepared(
-        key,
-        IrradianceCache(patches, mi.Float(irradiance)),
-        maps,
-        clusters and clusters["cluster"].ravel()[:n_patches],
-        metadata["stage_times"],
+        key, IrradianceCache(patches, table), maps, membership, metadata["stage_times"]
     )
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +28,11 @@ def write(path: str | os.PathLike, parts: Parts, metadata: dict) -> None:
     """
     path = Path(path)
     metadata = {"format": FORMAT, "checksum": _checksum(parts), **metadata}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        "displayWindow": _display_window(parts),
+    }
     exr_parts = [
         OpenEXR.Part(
             header | ({ATTRIBUTE: json.dumps(metadata)} if i == 0 else {}), channels, name=name
@@ -38,14 +41,12 @@ def write(path: str | os.PathLike, parts: Parts, metadata: dict) -> None:
     ]
     if not path.parent.is_dir():
         raise StorageError(f"{path}: there is no folder {path.parent}; make it first")
-    handle, temporary = tempfile.mkstemp(suffix=".exr", prefix=f".{path.stem}-", dir=path.parent)
-    os.close(handle)
+    temporary = path.with_name(f".{path.stem}-{os.getpid()}.exr")
     try:
-        OpenEXR.File(exr_parts).write(temporary)
+        OpenEXR.File(exr_parts).write(str(temporary))
         os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def read(path: str | os.PathLike, made_by: str) -> tuple[Parts, dict]:
@@ -54,7 +55,7 @@ def read(path: str | os.PathLike, made_by: str) -> tuple[Parts, dict]:
     Raises ``StorageError`` if the file is missing, truncated or none of ours; ``made_by`` tells
     the user where such files come from.
     """
-    path = Path(path)
+    path = Path(str(path))  # Mitsuba's own paths aren't os.PathLike.
     if not path.is_file():
         raise StorageError(f"{path}: no such file; {made_by}")
     try:
@@ -72,6 +73,12 @@ def read(path: str | os.PathLike, made_by: str) -> tuple[Parts, dict]:
     if not complete:
         raise StorageError(f"{path}: truncated or damaged; {made_by}")
     return parts, metadata
+
+
+def _display_window(parts: Parts) -> tuple[np.ndarray, np.ndarray]:
+    """OpenEXR wants one for all parts: the one that holds them all."""
+    shapes = [image.shape for channels in parts.values() for image in channels.values()]
+    return np.zeros(2, np.int32), np.max(shapes, axis=0)[::-1].astype(np.int32) - 1
 
 
 def _checksum(parts: Parts) -> str:

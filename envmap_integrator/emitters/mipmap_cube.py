@@ -55,6 +55,8 @@ class MipmapCube(mi.Emitter):
             )
         if shapes:
             names = tuple(name.strip() for name in shapes.split(",") if name.strip())
+            if not names:
+                raise ValueError(f'{parameters.owner}: "shapes" must list ids, not {shapes!r}')
             ratio = parameters.number("distance_ratio", None, 1.0)
             self.request = ClusterRequest(props.id(), names, ratio)
         else:
@@ -140,21 +142,29 @@ class MipmapCube(mi.Emitter):
         return self._distribution.eval_pmf_normalized(index, active) / solid_angle
 
     def _bilinear(self, direction, level: int, active):
-        """Four texels around a direction, each found through its own direction: no seams."""
+        """Four texels around a direction, each found through its own direction: no seams.
+
+        Only three texels meet at a corner of the cube; their mean stands for the fourth.
+        """
         resolution = mi.UInt32(self.cube_map.resolution)
         size = self.cube_map.resolution >> level
         face, uv = direction_to_face(direction)
         grid = (uv + 1) * (0.5 * size) - 0.5
         corner = dr.floor(grid)
         w = grid - corner
-        result = mi.Spectrum(0)
+        texels = []
         for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1)):
             centre = 2 * (corner + mi.Point2f(dx + 0.5, dy + 0.5)) / size - 1
             face_, uv_ = direction_to_face(face_to_direction(face, centre))
             index = texel(face_, uv_, resolution, mi.UInt32(size))
             weight = (w.x if dx else 1 - w.x) * (w.y if dy else 1 - w.y)
-            result += weight * dr.gather(mi.Spectrum, self._texels, index, active)
-        return result
+            value = dr.gather(mi.Spectrum, self._texels, index, active)
+            texels.append((weight, value, dr.all(dr.abs(centre) > 1)))
+        total = sum(value for _, value, _ in texels)
+        return sum(
+            weight * dr.select(missing, (total - value) / 3, value)
+            for weight, value, missing in texels
+        )
 
 
 def _load(owner, filename, name):

@@ -49,6 +49,15 @@ class CachedIntegrator(mi.SamplingIntegrator):
         """The integrator that bakes maps, if any."""
         return None
 
+    def to_string(self):
+        parameters = {
+            name: value
+            for name, value in vars(self).items()
+            if not name.startswith("_") and name != "owner"
+        }
+        listed = ",\n".join(f"  {name} = {value}" for name, value in parameters.items())
+        return f"{type(self).__name__}[\n{listed}\n]"
+
     # ---------------------- Preparation ----------------------
 
     def prepare(self, scene: mi.Scene) -> Prepared:

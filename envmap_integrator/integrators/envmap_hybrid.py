@@ -151,7 +151,7 @@ class EnvmapHybrid(CachedIntegrator):
             self._far_field = key, far_field(
                 scene,
                 prepared.maps,
-                prepared.cluster_of_patch,
+                prepared.cluster_of_cell,
                 n_samples,
                 self.mip_bias,
                 corrected=self.lookup == "corrected",

@@ -1,23 +1,30 @@
-"""Clusters: groups of objects that share one cube map (paper section 2, "map generation")."""
+"""Clusters: groups of surfaces that share one cube map (paper section 2, "map generation").
+
+A cluster is a set of cells of the coarse mesh, not of shapes: Mitsuba merges meshes that share a material, so one
+shape may be all the woodwork of a house.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import mitsuba as mi
 import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 
 from ..radiosity.surface_points import SurfacePoints
 
-#: Objects larger than this fraction of the scene are surroundings (floors, walls), not contents.
-LARGEST_OBJECT = 0.25
-#: Objects nearer to each other than this fraction of the scene may share a cluster.
-REACH = 0.3
+#: Flat pieces longer than this fraction of the scene are surroundings (floors, walls).
+LARGEST_PLANE = 0.4
+#: Diameter of automatic clusters, as a fraction of the scene.
+DIAMETER = 0.3
+#: Edge of the voxels that are grouped, as a fraction of the scene.
+VOXEL = 1 / 40
 #: A cluster seen by less than this fraction of the sensors' rays isn't worth a map.
 MIN_SEEN = 0.005
 MAX_CLUSTERS = 8
-#: Objects considered, most seen first: bounds the cost of hierarchical clustering.
-MAX_OBJECTS = 2000
+#: Voxels considered, most seen first: bounds the cost of hierarchical clustering.
+MAX_VOXELS = 3000
 
 
 @dataclass(frozen=True)
@@ -31,118 +38,149 @@ class ClusterRequest:
 
 @dataclass(frozen=True)
 class Cluster:
-    """Objects that share a cube.
+    """Surfaces that share a cube.
 
     name         for messages and files
-    objects      object ids
-    centre       [3] of the box around the objects, world space
-    radius       largest distance of the objects from the centre along an axis, world units
+    centre       [3] of the box around the surfaces, world space
+    radius       largest distance of the surfaces from the centre along an axis, world units
     half_width   of the cube around the centre, world units
     """
 
     name: str
-    objects: np.ndarray
     centre: np.ndarray
     radius: float
     half_width: float
 
 
 def listed_clusters(
-    points: SurfacePoints, scene, requests: list[ClusterRequest], distance_ratio: float
-) -> list[Cluster]:
-    """The clusters that the user listed.
+    points: SurfacePoints,
+    scene: mi.Scene,
+    requests: tuple[ClusterRequest, ...],
+    distance_ratio: float,
+) -> tuple[list[Cluster], np.ndarray]:
+    """The clusters that the user listed, and the cluster of every surface point [N], -1 if none.
 
     Raises ``ValueError`` if a shape isn't in the scene, is listed twice or has no surface.
     """
     ids = [shape.id() for shape in scene.shapes()]
-    clusters, owner = [], {}
-    for request in requests:
-        objects = []
+    clusters = []
+    cluster_of_object = np.full(len(ids), -1)
+    for index, request in enumerate(requests):
+        owner = f'mipmap_cube "{request.name}"'
         for shape_id in request.shape_ids:
             if shape_id not in ids:
                 raise ValueError(
-                    f'mipmap_cube "{request.name}": the scene has no shape "{shape_id}"; '
-                    f"it has {_shortened(ids)}"
+                    f'{owner}: the scene has no shape "{shape_id}"; it has {_some(ids)} '
+                    "(Mitsuba merges meshes that share a material: load with optimize=False)"
                 )
-            if shape_id in owner:
-                raise ValueError(
-                    f'mipmap_cube "{request.name}": shape "{shape_id}" is already in cluster '
-                    f'"{owner[shape_id]}"; list it once'
-                )
-            owner[shape_id] = request.name
-            objects.append(ids.index(shape_id))
-        member = np.isin(points.object_id, objects)
+            shape = ids.index(shape_id)
+            if cluster_of_object[shape] >= 0:
+                raise ValueError(f'{owner}: shape "{shape_id}" is listed twice; list it once')
+            cluster_of_object[shape] = index
+        member = cluster_of_object[points.object_id] == index
         if not member.any():
             raise ValueError(
-                f'mipmap_cube "{request.name}": no surface was found on its shapes '
-                f"{_shortened(list(request.shape_ids))}; are they hidden or empty?"
+                f"{owner}: no surface was found on {_some(request.shape_ids)}; is it empty?"
             )
         ratio = request.distance_ratio or distance_ratio
-        clusters.append(_cluster(request.name, np.array(objects), points.position[member], ratio))
-    return clusters
+        clusters.append(_cluster(request.name, points.position[member], ratio))
+    return clusters, cluster_of_object[points.object_id]
 
 
-def find_clusters(points: SurfacePoints, distance_ratio: float) -> list[Cluster]:
-    """Group the contents of the scene, as far as its sensors see them, into clusters."""
+def find_clusters(
+    points: SurfacePoints, distance_ratio: float
+) -> tuple[list[Cluster], np.ndarray]:
+    """Group the contents of the scene, as far as its sensors see them, into clusters.
+
+    Returns the clusters and the cluster of every surface point [N], -1 if it belongs to none.
+    """
+    cluster_of_point = np.full(len(points), -1)
     low, high = np.percentile(points.position, [2, 98], axis=0)
-    extent = float(np.linalg.norm(high - low))
-    n_objects = int(points.object_id.max(initial=0)) + 1
+    extent = max(float(np.linalg.norm(high - low)), 1e-30)
+    contents = np.flatnonzero(~_on_large_plane(points, extent))
+    if len(contents) == 0 or points.seen.sum() == 0:
+        return [], cluster_of_point
 
-    lowest, highest = np.full((n_objects, 3), np.inf), np.full((n_objects, 3), -np.inf)
-    np.minimum.at(lowest, points.object_id, points.position)
-    np.maximum.at(highest, points.object_id, points.position)
-    seen = np.bincount(points.object_id, weights=points.seen, minlength=n_objects)
-    with np.errstate(invalid="ignore"):
-        small = np.linalg.norm(highest - lowest, axis=1) < 2 * LARGEST_OBJECT * extent
-    objects = np.flatnonzero(small & (seen > 0))
-    objects = objects[np.argsort(-seen[objects], kind="stable")][:MAX_OBJECTS]
-    if len(objects) == 0:
-        return []
+    # ---- Voxels of what isn't surroundings ----
+    cell = np.floor(points.position[contents] / (VOXEL * extent)).astype(np.int64)
+    _, voxel = np.unique(cell, axis=0, return_inverse=True)
+    voxel = voxel.ravel()
+    seen = np.bincount(voxel, weights=points.seen[contents])
+    n_points = np.bincount(voxel)
+    centre = np.stack(
+        [np.bincount(voxel, weights=points.position[contents, i]) / n_points for i in range(3)], 1
+    )
+    kept = np.flatnonzero(seen > 0)
+    kept = kept[np.argsort(-seen[kept], kind="stable")][:MAX_VOXELS]
+    if len(kept) == 0:
+        return [], cluster_of_point
 
-    centres = 0.5 * (lowest + highest)[objects]
+    # ---- Groups of limited diameter ----
     group = np.ones(1, dtype=int)
-    if len(objects) > 1:
-        group = fcluster(linkage(centres, "complete"), REACH * extent, "distance")
-    share = np.bincount(group, weights=seen[objects]) / max(seen.sum(), 1)
+    if len(kept) > 1:
+        group = fcluster(linkage(centre[kept], "complete"), DIAMETER * extent, "distance")
+    share = np.bincount(group, weights=seen[kept]) / points.seen.sum()
     best = [g for g in np.argsort(-share, kind="stable") if share[g] >= MIN_SEEN][:MAX_CLUSTERS]
 
     clusters = []
-    for number, g in enumerate(best):
-        members = objects[group == g]
-        position = points.position[np.isin(points.object_id, members)]
-        clusters.append(_cluster(f"cluster{number}", members, position, distance_ratio))
     lowest, highest = points.position.min(axis=0), points.position.max(axis=0)
-    return [c for c in clusters if not _holds(c, lowest, highest)]
+    for g in best:
+        member = contents[np.isin(voxel, kept[group == g])]
+        cluster = _cluster(f"cluster{len(clusters)}", points.position[member], distance_ratio)
+        if not _holds(cluster, lowest, highest):
+            cluster_of_point[member] = len(clusters)
+            clusters.append(cluster)
+    return clusters, cluster_of_point
 
 
-def cluster_of_patch(
-    clusters: list[Cluster], points: SurfacePoints, patch_of_point: np.ndarray, n_patches: int
+def cluster_of_cell(
+    n_clusters: int, cluster_of_point: np.ndarray, cell_of_point: np.ndarray, n_cells: int
 ) -> np.ndarray:
-    """Cluster index of every patch [P], ``len(clusters)`` where it belongs to none."""
-    n_objects = int(points.object_id.max(initial=0)) + 1
-    of_object = np.full(n_objects, len(clusters), dtype=np.uint32)
-    for index, cluster in enumerate(clusters):
-        of_object[cluster.objects[cluster.objects < n_objects]] = index
-    result = np.full(n_patches, len(clusters), dtype=np.uint32)
-    has_patch = patch_of_point >= 0
-    result[patch_of_point[has_patch]] = of_object[points.object_id[has_patch]]
-    return result
+    """Cluster of every large cell of the coarse mesh, ``n_clusters`` where it belongs to none.
+
+    A cell belongs to the cluster that most of its surface points belong to.
+    """
+    votes = np.zeros((n_cells, n_clusters + 1), dtype=np.int64)
+    known = cell_of_point >= 0
+    np.add.at(votes, (cell_of_point[known], cluster_of_point[known]), 1)
+    # No cluster is -1, the last column, which ``argmax`` finds as ``n_clusters``.
+    return votes.argmax(axis=1).astype(np.uint32)
 
 
-def _cluster(name, objects, position, distance_ratio):
+def _on_large_plane(points: SurfacePoints, extent: float) -> np.ndarray:
+    """Which points [N] lie on flat pieces that are large compared to the scene."""
+    offset = (points.position * points.normal).sum(axis=1)
+    # Shifted bins: normals and offsets of buildings sit on round numbers.
+    key = np.column_stack(
+        [
+            points.object_id,
+            np.floor(points.normal * 8 + 0.377),
+            np.floor(offset * (200 / extent) + 0.377),
+        ]
+    ).astype(np.int64)
+    _, plane = np.unique(key, axis=0, return_inverse=True)
+    plane = plane.ravel()
+    n_planes = int(plane.max()) + 1
+    lowest, highest = np.full((n_planes, 3), np.inf), np.full((n_planes, 3), -np.inf)
+    np.minimum.at(lowest, plane, points.position)
+    np.maximum.at(highest, plane, points.position)
+    return (np.linalg.norm(highest - lowest, axis=1) > LARGEST_PLANE * extent)[plane]
+
+
+def _cluster(name: str, position: np.ndarray, distance_ratio: float) -> Cluster:
     low, high = position.min(axis=0), position.max(axis=0)
     radius = max(float((high - low).max()) / 2, 1e-30)
-    return Cluster(name, objects, (low + high) / 2, radius, distance_ratio * radius)
+    return Cluster(name, (low + high) / 2, radius, distance_ratio * radius)
 
 
-def _holds(cluster, low, high):
-    """Does the cube hold the whole scene, so that nothing is left to put into a map?"""
+def _holds(cluster: Cluster, low: np.ndarray, high: np.ndarray) -> bool:
+    """Does the cube hold the whole scene, so that nothing is left for a map?"""
     inside = (cluster.centre - cluster.half_width <= low) & (
         cluster.centre + cluster.half_width >= high
     )
     return bool(inside.all())
 
 
-def _shortened(names: list[str]) -> str:
+def _some(names) -> str:
     listed = ", ".join(f'"{name}"' for name in names[:8])
     return listed + (f", … ({len(names)} in all)" if len(names) > 8 else "")

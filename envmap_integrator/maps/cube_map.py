@@ -50,7 +50,6 @@ def to_parts(cube_map: CubeMap, prefix: str = "") -> tuple[Parts, dict]:
     cluster = cube_map.cluster
     metadata = {
         "name": cluster.name,
-        "objects": cluster.objects.tolist(),
         "centre": cluster.centre.tolist(),
         "radius": cluster.radius,
         "half_width": cluster.half_width,
@@ -71,7 +70,6 @@ def from_parts(parts: Parts, metadata: dict, prefix: str = "") -> CubeMap:
             levels.append(np.stack(np.split(image, 6, axis=1)))
         cluster = Cluster(
             metadata["name"],
-            np.array(metadata["objects"], dtype=np.int64),
             np.array(metadata["centre"]),
             metadata["radius"],
             metadata["half_width"],

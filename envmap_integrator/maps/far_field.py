@@ -29,7 +29,7 @@ class FarField:
     cubes              [M * 4]   centre and half width of each cube, world units
     texels             [M * T * (C + 1)]  radiance [W/m²/sr] by C channels and inverse distance
                                  [1/m] from the centre; T texels a map, laid out as in ``cube``
-    cluster_of_patch   [P]       cluster index, M where a patch belongs to none
+    cluster_of_cell    cluster index of each large cell of the coarse mesh, M where there is none
     resolution         [1]       face resolution R of the finest level
     n_samples          [1]       samples that share a pixel: spp times secondary samples
     mip_bias           [1]       levels added to the look-up
@@ -41,7 +41,7 @@ class FarField:
 
     cubes: mi.Float
     texels: mi.Float
-    cluster_of_patch: mi.UInt32
+    cluster_of_cell: mi.UInt32
     n_clusters: mi.UInt32
     resolution: mi.UInt32
     n_samples: mi.Float
@@ -51,13 +51,13 @@ class FarField:
     sources: mi.Scene | None
     has_environment: bool
 
-    def bound(self, patch, ray, pdf, specular, u, active):
-        """Bound a ray that starts on a patch by the cube of the patch's cluster.
+    def bound(self, cell, ray, pdf, specular, u, active):
+        """Bound a ray that starts in a cell of the coarse mesh by the cube of the cell's cluster.
 
         Returns ``(cluster, bounded, maxt)``. Rays from outside their cube and lobes too narrow
         for the map's texels aren't bounded.
         """
-        cluster = dr.gather(mi.UInt32, self.cluster_of_patch, patch, active)
+        cluster = dr.gather(mi.UInt32, self.cluster_of_cell, cell, active)
         bounded = active & (cluster < self.n_clusters)
         texel_solid_angle = 4 / dr.square(mi.Float(self.resolution))
         if not self.map_mirrors:
@@ -149,7 +149,7 @@ class FarField:
 def far_field(
     scene: mi.Scene,
     maps: tuple[CubeMap, ...],
-    cluster_of_patch: np.ndarray,
+    cluster_of_cell: np.ndarray,
     n_samples: int,
     mip_bias: float,
     corrected: bool,
@@ -162,7 +162,7 @@ def far_field(
     return FarField(
         cubes=mi.Float(np.array(cubes, dtype=np.float32).ravel()),
         texels=mi.Float(np.concatenate([cube_map.texels() for cube_map in maps]).ravel()),
-        cluster_of_patch=mi.UInt32(cluster_of_patch),
+        cluster_of_cell=mi.UInt32(cluster_of_cell),
         n_clusters=dr.opaque(mi.UInt32, len(maps)),
         resolution=dr.opaque(mi.UInt32, maps[0].resolution),
         n_samples=dr.opaque(mi.Float, n_samples),

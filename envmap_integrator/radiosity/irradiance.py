@@ -30,7 +30,7 @@ MAX_LANES = 1 << 22
 
 @dataclass(frozen=True)
 class IrradianceCache:
-    """Irradiance on both the patches' sides (a side is a patch of its own).
+    """Irradiance on the patches; each side of a surface has patches of its own.
 
     patches   the coarse mesh
     table     [2 * P * C]  W/m²: row 2p total, row 2p + 1 indirect irradiance of patch p, by C
@@ -60,17 +60,17 @@ def solve_irradiance(
     b the light that gather rays find outside the patches, and w the throughput with which they
     end in patch j, the solution fulfils E_i = mean(π b + w E(j)), where E(j) is E_d + E_i or E_i.
     """
-    n_patches = transport.patches.count
-    order = np.argsort(patch_of_point, kind="stable")
-    order = order[patch_of_point[order] >= 0]
+    order = np.flatnonzero(_worth_gathering(points, patch_of_point, transport.patches.count))
+    order = order[np.argsort(patch_of_point[order], kind="stable")]
+    patches, first = np.unique(patch_of_point[order], return_index=True)
+    first = np.append(first, len(order))
     points = points.take(order)
-    first = np.searchsorted(patch_of_point[order], np.arange(n_patches + 1))
 
     launch = max(MAX_LANES // samples, 1)
     parts = []
-    with stage("Gathering irradiance", total=n_patches) as advance:
-        for begin in range(0, n_patches, launch):
-            end = min(begin + launch, n_patches)
+    with stage("Gathering irradiance", total=len(patches)) as advance:
+        for begin in range(0, len(patches), launch):
+            end = min(begin + launch, len(patches))
             parts.append(
                 _gather(scene, transport, points, first, begin, end, samples, seed + 1 + begin)
             )
@@ -79,7 +79,22 @@ def solve_irradiance(
         parts[0][i] if len(parts) == 1 else dr.concat([part[i] for part in parts], axis=-1)
         for i in range(4)
     )
-    return IrradianceCache(transport.patches, _solve(direct, escaped, weight, row, samples))
+    table = _solve(
+        transport.patches.count, mi.UInt32(patches), direct, escaped, weight, row, samples
+    )
+    return IrradianceCache(transport.patches, table)
+
+
+def _worth_gathering(points, patch_of_point, n_patches):
+    """Which surface points [N] stand for their patch: if walks have come to it, only theirs.
+
+    Global lines also hit what no light reaches, such as the floor under a cupboard; it would
+    darken the part of the patch that looks out.
+    """
+    has_patch = patch_of_point >= 0
+    visited = np.zeros(n_patches, dtype=bool)
+    visited[patch_of_point[has_patch & (points.seen > 0)]] = True
+    return has_patch & ((points.seen > 0) | ~visited[patch_of_point])
 
 
 def _gather(scene, transport, points, first, begin, end, samples, seed):
@@ -158,16 +173,13 @@ def finite(x):
     return dr.select(dr.isfinite(x), x, 0)
 
 
-def _solve(direct, escaped, weight, row, samples):
+def _solve(n_patches, patch, direct, escaped, weight, row, samples):
     """Iterate E_i = escaped + mean(w E(row)) to convergence; returns the irradiance table."""
     direct, escaped = dr.ravel(direct), dr.ravel(escaped)
-    n_channels = len(weight)
-    patch = dr.arange(mi.UInt32, dr.width(direct) // n_channels)
-    table = dr.zeros(mi.Float, 2 * dr.width(direct))
+    table = dr.zeros(mi.Float, 2 * n_patches * len(weight))
 
     def store(indirect):
-        total = dr.unravel(mi.Spectrum, direct + indirect)
-        dr.scatter(table, total, 2 * patch)
+        dr.scatter(table, dr.unravel(mi.Spectrum, direct + indirect), 2 * patch)
         dr.scatter(table, dr.unravel(mi.Spectrum, indirect), 2 * patch + 1)
         dr.eval(table)
 

@@ -1,15 +1,15 @@
-"""The coarse mesh: patches on a hashed octree over the surface points of a scene.
+"""The coarse mesh: patches on hashed grids over the surface points of a scene.
 
-A patch is a cell of the octree, restricted to one object and to normals of one dominant
-direction, so that the two sides of a wall, and a book and the table under it, never share one.
-Cells are split where surface points are dense: the number of patches is bounded by a budget and
-doesn't depend on the number of triangles. The patch of a surface point is found from its position,
-normal and shape alone, in a bounded number of gathers.
+A patch is a cell of a grid, restricted to one object and to normals of one dominant direction, so
+that the two sides of a wall, and a book and the table under it, never share one. Large cells
+choose how finely they are divided by how densely surface points lie in them: the number of patches
+is bounded by a budget and doesn't depend on the number of triangles. The patch of a surface point
+is found from its position, normal and shape alone, by two packed gathers without a loop.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -18,78 +18,102 @@ import numpy as np
 from ..jit import opaque_point
 from .surface_points import ObjectIds, SurfacePoints
 
-#: Octree levels; level 0 cells have the edge ``Patches.size``, each level halves it.
-LEVELS = 10
-#: Largest patch edge as a fraction of the diagonal of the box that holds most surface points.
-LARGEST = 1 / 32
+#: Edge of the large cells as a fraction of the diagonal of the box that holds most surface points,
+#: and how often they may be halved. Patches are at most half as large.
+LARGE_CELL = 1 / 16
+MAX_LEVEL = 7
 #: Patches with fewer surface points than this aren't trusted with an irradiance.
 MIN_POINTS = 2
-#: Bits of the normal's dominant direction and of the level in the hash key.
-_NORMAL_STRIDE, _OBJECT_STRIDE = 16, 128
+#: Entries of a bucket of the hash tables, read by one packed gather.
+BUCKET = 4
+#: Bits of an entry of the large cells' table that hold the level.
+_LEVEL_BITS = 3
 
 
 @dataclass(frozen=True)
 class Patches:
-    """Hash table from (position, normal, object) to patch index.
+    """Two hash tables: large cell → level of division, cell of that level → patch.
 
-    origin   [3]         corner of the grid, world space
-    size     [1]         edge of a level 0 cell, world units
-    table    [2 * M]     (fingerprint, patch index) pairs, M a power of two, linear probing
-    mask     [1]         M - 1
-    use_objects          whether the object id is part of the key (not with too many objects)
-    count                number of patches P
+    A patch's index is the place of its entry in the table. An entry is a fingerprint of the cell;
+    where a bucket overflows, the patch is left out (about one in 10⁴).
+
+    origin      [3]              corner of the grids, world space
+    size        [1]              edge of a large cell, world units
+    levels      [4 * buckets]    fingerprint and level of each large cell, 0 where empty
+    cells       [P]              fingerprint of each patch, 0 where empty
+    use_objects                  whether the object id tells cells apart (not with too many objects)
     """
 
     origin: mi.Point3f
     size: mi.Float
-    table: mi.UInt32
-    mask: mi.UInt32
+    levels: mi.UInt32
+    cells: mi.UInt32
     use_objects: bool
-    count: int
 
-    @dr.syntax
-    def find(self, p, normal, object_id, active=True):
-        """Look up the patch of an oriented surface point.
+    @property
+    def count(self) -> int:
+        """Number of patch indices P, used or not."""
+        return dr.width(self.cells)
 
-        Returns ``(patch, size, found)``: the index, the edge of the patch in world units, and
-        whether there is a patch. Surfaces too small to have been hit have none.
+    def find_cell(self, p, normal, object_id, active=True):
+        """Look up the large cell of an oriented surface point.
+
+        Returns ``(cell, size, found)``: the index of the cell, the edge of the patches in it in
+        world units, and whether there is such a cell.
         """
-        level = mi.UInt32(0)
-        probe = mi.UInt32(0)
-        patch = mi.UInt32(0)
-        found = mi.Bool(False)
-        searching = mi.Bool(active)
-        side = normal_direction(normal)
-        identity = side * _NORMAL_STRIDE
-        if dr.hint(self.use_objects, mode="scalar"):
-            identity += object_id * _OBJECT_STRIDE
-        while dr.hint(searching, exclude=[self], label="Find patch"):
-            slot, fingerprint = cell_hash(self.origin, self.size, p, identity, level)
-            entry = dr.gather(mi.Vector2u, self.table, (slot + probe) & self.mask, searching)
-            found = entry.x == fingerprint
-            empty = entry.x == 0
-            patch = entry.y
-            probe = dr.select(empty, 0, probe + 1)
-            level += dr.select(empty, mi.UInt32(1), mi.UInt32(0))
-            searching &= ~found & (level < LEVELS)
-        size = self.size / mi.Float(mi.UInt32(1) << dr.minimum(level, LEVELS - 1))
-        return patch, size, found
+        identity = self._identity(normal, object_id)
+        entry, found, cell = self._probe(
+            self.levels, p, identity, mi.UInt32(0), _LEVEL_BITS, active
+        )
+        level = (entry & ((1 << _LEVEL_BITS) - 1)) + 1
+        return cell, self.size / mi.Float(mi.UInt32(1) << level), found
 
-    def find_jittered(self, p, normal, object_id, u, active=True):
-        """As ``find``, at a point moved at random by half a patch along the surface.
+    def find(self, p, normal, object_id, size, active=True, u=None):
+        """Look up the patch of an oriented surface point in a cell with patches of edge ``size``.
 
-        The expectation over ``u`` (uniform in the unit square) interpolates between patches, so
-        their borders don't show. Where the moved point belongs to no patch (beyond an edge of the
-        surface), the patch of the point itself is taken.
+        Returns ``(patch, found)``. Surfaces too small to have been hit have no patch.
+
+        With ``u``, uniform in the unit square, the point is moved at random by up to half a patch
+        along the surface: the expectation interpolates between patches, so their borders don't
+        show. Where the moved point belongs to no patch (beyond an edge of the surface), the patch
+        of the point itself is taken.
         """
-        patch, size, found = self.find(p, normal, object_id, active)
+        level = mi.UInt32(dr.log2(self.size / size) + 0.5)
+        identity = self._identity(normal, object_id)
+        if u is None:
+            _, found, patch = self._probe(self.cells, p, identity, level, 0, active)
+            return patch, found
+
         frame = mi.Frame3f(normal)
-        shift = size * (frame.s * (u.x - 0.5) + frame.t * (u.y - 0.5))
+        moved = p + size * (frame.s * (u.x - 0.5) + frame.t * (u.y - 0.5))
         # Low bits of u tilt the normal too: curved surfaces change dominant direction smoothly.
         v = mi.Point2f(256 * u.x - dr.floor(256 * u.x), 256 * u.y - dr.floor(256 * u.y))
         tilted = normal + 0.4 * (frame.s * (v.x - 0.5) + frame.t * (v.y - 0.5))
-        near, _, near_found = self.find(p + shift, tilted, object_id, found)
-        return dr.select(near_found, near, patch), size, found
+        around = self._identity(tilted, object_id)
+        _, found, patch = self._probe(self.cells, moved, around, level, 0, active)
+        missed = active & ~found
+        _, own_found, own = self._probe(self.cells, p, identity, level, 0, missed)
+        return dr.select(found, patch, own), found | (missed & own_found)
+
+    def _identity(self, normal, object_id):
+        """What tells patches in the same cell apart."""
+        direction = normal_direction(normal)
+        return direction + object_id * 8 if self.use_objects else direction
+
+    def _probe(self, table, p, identity, level, payload_bits, active):
+        """Look for a cell in a table: ``(entry, found, index)``."""
+        scale = mi.Float(mi.UInt32(1) << level) / self.size
+        cell = mi.Vector3i(dr.floor((p - self.origin) * scale))
+        slot, fingerprint = cell_hash(cell, identity, level)
+        bucket = slot & (dr.width(table) // BUCKET - 1)
+        entries = dr.gather(mi.Vector4u, table, bucket, active)
+        found, index, entry = mi.Bool(False), mi.UInt32(0), mi.UInt32(0)
+        for i in range(BUCKET):
+            match = active & (entries[i] >> payload_bits == fingerprint >> payload_bits)
+            index = dr.select(match, bucket * BUCKET + i, index)
+            entry = dr.select(match, entries[i], entry)
+            found |= match
+        return entry, found, index
 
 
 def normal_direction(normal):
@@ -108,86 +132,90 @@ def normal_direction(normal):
     return 2 * axis + dr.select(component < 0, mi.UInt32(1), mi.UInt32(0))
 
 
-def cell_hash(origin, size, p, identity, level):
-    """Slot and non-zero fingerprint of the cell that holds ``p`` on an octree level."""
-    scale = mi.Float(mi.UInt32(1) << level) / size
-    cell = dr.reinterpret_array(mi.Vector3u, mi.Vector3i(dr.floor((p - origin) * scale)))
-    key = cell.x * 0x9E3779B1 + cell.y * 0x85EBCA77 + cell.z * 0xC2B2AE3D
-    slot, fingerprint = mi.sample_tea_32(key, identity + level, 4)
-    return slot, dr.maximum(fingerprint, 1)
+def cell_hash(cell, identity, level):
+    """Two independent hashes of a cell: its slot and its fingerprint.
+
+    Fingerprints aren't zero, also without the bits that a level takes in their place.
+    """
+    c = dr.reinterpret_array(mi.Vector3u, cell)
+    name = identity * 16 + level
+    slot = _mix(c.x * 0x8DA6B343 + c.y * 0xD8163841 + c.z * 0xCB1AB31F + name * 0x9E3779B1)
+    fingerprint = _mix(c.x * 0xC2B2AE3D + c.y * 0x27D4EB2F + c.z * 0x165667B1 + name * 0x85EBCA77)
+    return slot, fingerprint | (1 << _LEVEL_BITS)
+
+
+def _mix(h):
+    """Finaliser of MurmurHash3: every input bit affects every output bit."""
+    h = (h ^ (h >> 16)) * 0x85EBCA6B
+    h = (h ^ (h >> 13)) * 0xC2B2AE35
+    return h ^ (h >> 16)
 
 
 def build_patches(
     points: SurfacePoints, object_ids: ObjectIds, budget: int
-) -> tuple[Patches, np.ndarray]:
+) -> tuple[Patches, np.ndarray, np.ndarray]:
     """Build the coarse mesh over ``points`` with about ``budget`` patches.
 
-    Returns the patches and the patch index of every point [N], -1 where it has none.
+    Returns the patches and, of every point, the patch index and the large cell's [N], -1 where
+    it has none.
     """
     low, high = np.percentile(points.position, [2, 98], axis=0)
-    size = max(float(np.linalg.norm(high - low)) * LARGEST, 1e-30)
+    size = max(float(np.linalg.norm(high - low)) * LARGE_CELL, 1e-30)
     # An irrational offset keeps walls, mostly at round coordinates, off the cell borders.
     origin = points.position.min(axis=0) - size * np.array([0.3819, 0.4142, 0.2361])
-    use_objects = object_ids.count * 8 <= budget
-    identity = normal_direction(mi.Normal3f(points.normal.T)) * _NORMAL_STRIDE
-    if use_objects:
-        identity += mi.UInt32(points.object_id) * _OBJECT_STRIDE
-    position = mi.Point3f(points.position.T)
-    split_above = max(2 * len(points) // budget, MIN_POINTS)
-
-    patch_of_point = np.full(len(points), -1, dtype=np.int64)
-    keys = []
-    n_patches = 0
-    pending = np.arange(len(points))
-    for level in range(LEVELS):
-        slot, fingerprint = cell_hash(
-            opaque_point(origin), mi.Float(size), position, identity, mi.UInt32(level)
-        )
-        key = (slot.numpy().astype(np.uint64) << 32) | fingerprint.numpy().astype(np.uint64)
-        cells, cell_of_point, n_points = np.unique(
-            key[pending], return_inverse=True, return_counts=True
-        )
-        leaf = (n_points <= split_above) | (level == LEVELS - 1)
-        kept = leaf & (n_points >= MIN_POINTS)
-        index = np.where(kept, n_patches + np.cumsum(kept) - 1, -1)
-        is_leaf = leaf[cell_of_point]
-        patch_of_point[pending[is_leaf]] = index[cell_of_point[is_leaf]]
-        keys.append(cells[kept])
-        n_patches += int(kept.sum())
-        pending = pending[~is_leaf]
-        if len(pending) == 0:
-            break
-
-    table, mask = _hash_table(np.concatenate(keys))
     patches = Patches(
         origin=opaque_point(origin),
         size=dr.opaque(mi.Float, size),
-        table=mi.UInt32(table),
-        mask=dr.opaque(mi.UInt32, mask),
-        use_objects=use_objects,
-        count=n_patches,
+        levels=mi.UInt32(0),
+        cells=mi.UInt32(0),
+        use_objects=object_ids.count * 8 <= budget,
     )
-    return patches, patch_of_point
+    identity = patches._identity(
+        mi.Normal3f(points.normal.T), mi.UInt32(points.object_id.astype(np.uint32))
+    )
+    position = mi.Point3f(points.position.T)
+
+    # ---- Large cells choose their level by their number of points ----
+    key = _keys(patches, position, identity, mi.UInt32(0))
+    large, cell_of_point, n_points = np.unique(key, return_inverse=True, return_counts=True)
+    level = np.ceil(0.5 * np.log2(np.maximum(n_points * budget / len(points), 1)))
+    level = np.clip(level - 1, 0, MAX_LEVEL).astype(np.uint64)
+    payload = np.uint64((1 << _LEVEL_BITS) - 1)
+    levels, index_of_large = _hash_table((large & ~payload) | level)
+    large_of_point = index_of_large[cell_of_point]
+
+    # ---- Their cells are the patches ----
+    level_of_point = mi.UInt32(level[cell_of_point].astype(np.uint32) + 1)
+    key = _keys(patches, position, identity, level_of_point)
+    cells, cell_of_point, n_points = np.unique(key, return_inverse=True, return_counts=True)
+    kept = n_points >= MIN_POINTS
+    table, index = _hash_table(cells[kept])
+    patch_of_cell = np.full(len(cells), -1)
+    patch_of_cell[kept] = index
+    patches = replace(patches, levels=mi.UInt32(levels), cells=mi.UInt32(table))
+    return patches, patch_of_cell[cell_of_point], large_of_point
 
 
-def _hash_table(keys: np.ndarray) -> tuple[np.ndarray, int]:
-    """Insert keys (slot << 32 | fingerprint), numbered by position, by linear probing."""
-    size = 1 << int(np.ceil(np.log2(3 * len(keys) + 8)))
-    table = np.zeros((size, 2), dtype=np.uint32)
-    slot = (keys >> np.uint64(32)).astype(np.int64)
-    pending = np.arange(len(keys))
-    probe = 0
-    while len(pending):
-        position = (slot[pending] + probe) & (size - 1)
-        free = table[position, 0] == 0
-        # Several keys may want the same free slot: the first one gets it.
-        _, first = np.unique(position, return_index=True)
-        wins = np.zeros(len(pending), dtype=bool)
-        wins[first] = True
-        wins &= free
-        winners = pending[wins]
-        table[position[wins], 0] = (keys[winners] & np.uint64(0xFFFFFFFF)).astype(np.uint32)
-        table[position[wins], 1] = winners
-        pending = pending[~wins]
-        probe += 1
-    return table.ravel(), size - 1
+def _keys(patches: Patches, position, identity, level) -> np.ndarray:
+    """Slot and fingerprint [N] of the cells of points, in one word."""
+    scale = mi.Float(mi.UInt32(1) << level) / patches.size
+    cell = mi.Vector3i(dr.floor((position - patches.origin) * scale))
+    slot, fingerprint = cell_hash(cell, identity, level)
+    return (slot.numpy().astype(np.uint64) << np.uint64(32)) | fingerprint.numpy()
+
+
+def _hash_table(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Put the fingerprints of keys into buckets; returns the table and the index of each key [K].
+
+    The index is -1 where the bucket was full. Two buckets a key make that rare.
+    """
+    n_buckets = 1 << int(np.ceil(np.log2(2 * len(keys) + 1)))
+    bucket = ((keys >> np.uint64(32)) & np.uint64(n_buckets - 1)).astype(np.int64)
+    order = np.argsort(bucket, kind="stable")
+    first = np.searchsorted(bucket[order], bucket[order])
+    rank = np.empty(len(keys), dtype=np.int64)
+    rank[order] = np.arange(len(keys)) - first
+    index = np.where(rank < BUCKET, bucket * BUCKET + rank, -1)
+    table = np.zeros(n_buckets * BUCKET, dtype=np.uint32)
+    table[index[index >= 0]] = (keys[index >= 0] & np.uint64(0xFFFFFFFF)).astype(np.uint32)
+    return table, index

@@ -12,7 +12,7 @@ from .transport import (
     PathState,
     Transport,
     camera_path,
-    find_patch,
+    facing,
     follow,
     sample_sources,
     skip_sources,
@@ -47,13 +47,14 @@ def camera_radiance(
     hit = active & si.is_valid()
     bsdf = si.bsdf(ray)
     smooth = hit & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-    patch, _, found = find_patch(transport, si, ray, sampler.next_2d(), smooth)
+    cell, _, found = transport.patches.find_cell(
+        si.p, facing(si, ray), transport.object_ids(si), smooth
+    )
 
     emitted = si.emitter(scene).eval(si, active & (not transport.hide_emitters))
-    n_shadow = mi.UInt32(transport.shadow_samples)
-    several = transport.shadow_samples > 1
+    nowhere = mi.Bool(False)
     radiance = emitted + sample_sources(
-        scene, si, bsdf, sampler, n_shadow, several, mi.Bool(False), smooth
+        scene, si, bsdf, sampler, mi.UInt32(transport.shadow_samples), nowhere, nowhere, smooth
     )
 
     # ---------------------- Secondary rays, stratified ----------------------
@@ -67,7 +68,7 @@ def camera_radiance(
     while dr.hint(pending, exclude=[transport, beyond, cache, bsdf], label="Secondary rays"):
         u = (mi.Float(i) + sampler.next_1d()) / mi.Float(secondary_samples)
         bs, weight = bsdf.sample(ctx, si, u, sampler.next_2d(), pending)
-        start = leave(transport, sampler, si, bs, patch, found)
+        start = leave(transport, sampler, si, bs, cell, found)
         end = follow(scene, beyond, sampler, start, pending & (dr.max(weight) > 0))
         sum_ += weight * (end.radiance + end.weight * cache.irradiance(end.row) * dr.inv_pi)
         valid |= end.valid | (pending & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null))
@@ -76,7 +77,7 @@ def camera_radiance(
     return radiance + sum_ / secondary_samples, si.t, valid
 
 
-def leave(transport, sampler, si, bs, patch, found):
+def leave(transport, sampler, si, bs, cell, found):
     """The path that leaves a camera hit in a sampled direction."""
     specular = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     start = PathState(
@@ -90,6 +91,6 @@ def leave(transport, sampler, si, bs, patch, found):
     )
     if transport.far_field is not None:
         start.cluster, start.bounded, start.ray.maxt = transport.far_field.bound(
-            patch, start.ray, bs.pdf, specular, sampler.next_1d(), found
+            cell, start.ray, bs.pdf, specular, sampler.next_1d(), found
         )
     return start

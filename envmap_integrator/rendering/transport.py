@@ -202,31 +202,43 @@ def follow(
 
         bsdf = si.bsdf(ray)
         smooth = hit & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        patch, size, found = find_patch(transport, si, ray, sampler.next_2d(), smooth)
+        normal, object_id = facing(si, ray), transport.object_ids(si)
+        cell, size, found = patches.find_cell(si.p, normal, object_id, smooth)
+        deep = found & (depth >= transport.gather_depth)
+        patch, has_patch = patches.find(si.p, normal, object_id, size, deep, sampler.next_2d())
         # A coarse mesh can't serve hits about as near as its patches are large (corners,
         # contacts). The threshold is random, so that no border shows.
         near = (bounces > 0) & (dr.norm(si.p - origin.p) < size * (0.5 + sampler.next_1d()))
-        served = found & ~near & (depth >= transport.gather_depth)
-        # Total irradiance stands for direct light too, but only under diffuse lobes.
-        lit_by_cache = served & (depth > 0) & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy)
+        served = has_patch & ~near
+        # Total irradiance stands for direct light too.
+        lit = served & (depth > 0)
         if dr.hint(transport.shadow_rays, mode="scalar"):
-            lit_by_cache = mi.Bool(False)
-        n_shadow = dr.select(depth == 0, mi.UInt32(transport.shadow_samples), mi.UInt32(1))
-        radiance += throughput * sample_sources(
-            scene, si, bsdf, sampler, n_shadow, transport.shadow_samples > 1, served,
-            smooth & ~lit_by_cache,
-        )  # fmt: skip
+            lit = mi.Bool(False)
+        sampled = smooth & ~(lit & only_wide(bsdf))
+        if dr.hint(transport.shadow_samples > 1, mode="scalar"):
+            # Camera hits get several; further on one more sample of the pixel serves better.
+            n = dr.select(depth == 0, mi.UInt32(transport.shadow_samples), mi.UInt32(1))
+            light = sample_sources(scene, si, bsdf, sampler, n, served, lit, sampled)
+            bs, bsdf_weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), hit)
+        else:
+            ds, em_weight = scene.sample_emitter_direction(si, sampler.next_2d(), False, sampled)
+            bsdf_value, bsdf_pdf, bs, bsdf_weight = bsdf.eval_pdf_sample(
+                ctx, si, si.to_local(ds.d), sampler.next_1d(), sampler.next_2d(), hit
+            )
+            light = reflected_source(
+                scene, si, ds, em_weight, bsdf_value, bsdf_pdf, served, lit, sampled
+            )
+        radiance += throughput * light
 
         # ---------------------- End in the cache ----------------------
 
-        bs, bsdf_weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), hit)
         throughput *= bsdf_weight
         eta *= bs.eta
         valid |= hit & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         sampled_specular = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         ends = served & ~sampled_specular & is_wide(si, bs.wo, bs.pdf)
         weight[ends] = throughput
-        row[ends] = 2 * patch + dr.select(lit_by_cache, mi.UInt32(0), mi.UInt32(1))
+        row[ends] = 2 * patch + dr.select(lit, mi.UInt32(0), mi.UInt32(1))
 
         # ---------------------- Next ray ----------------------
 
@@ -235,12 +247,12 @@ def follow(
         ray = dr.select(retrace, mi.Ray3f(ray(ray.maxt), ray.d), next_ray)
         ray.maxt = dr.largest(mi.Float)
         pdf = dr.select(retrace, pdf, bs.pdf)
-        specular = dr.select(retrace, specular, sampled_specular | lit_by_cache)
+        specular = dr.select(retrace, specular, sampled_specular)
         origin = dr.select(retrace, origin, mi.Interaction3f(si))
         depth += dr.select(hit & ~sampled_specular, mi.UInt32(1), mi.UInt32(0))
         if dr.hint(far_field is not None, mode="scalar"):
             cluster, bounded, maxt = far_field.bound(
-                patch, ray, pdf, sampled_specular, sampler.next_1d(), found & ~retrace
+                cell, ray, pdf, sampled_specular, sampler.next_1d(), found & ~retrace
             )
             ray.maxt = maxt
         active &= retrace | (hit & ~ends & (dr.max(throughput) != 0))
@@ -256,47 +268,50 @@ def follow(
     return PathEnd(radiance, direct, weight, row, valid, distance)
 
 
-def find_patch(transport, si, ray, u, active):
-    """Patch on the side of a surface that a ray hits: ``(patch, size, found)``."""
-    normal = dr.select(dr.dot(si.n, ray.d) > 0, -si.n, si.n)
-    return transport.patches.find_jittered(
-        si.p, normal, transport.object_ids(si), u, active
-    )
+def facing(si, ray):
+    """Geometric normal on the side of a surface that a ray hits."""
+    return dr.mulsign(si.n, -dr.dot(si.n, ray.d))
 
 
 @dr.syntax
-def sample_sources(scene, si, bsdf, sampler, count, several, served, active):
-    """Direct light [W/m²/sr] reflected at a surface, by ``count`` stratified shadow rays a lane.
-
-    ``several`` tells whether any count exceeds one. Where the cache serves the surface
-    (``served``), directions under wide lobes are never traced: there shadow rays count alone.
-    """
+def sample_sources(scene, si, bsdf, sampler, count, served, lit, active):
+    """Direct light [W/m²/sr] reflected at a surface, by ``count`` stratified shadow rays a lane."""
     ctx = mi.BSDFContext()
     result = mi.Spectrum(0)
     i = mi.UInt32(0)
     active = mi.Bool(active)
-    if dr.hint(several, mode="scalar"):
-        while dr.hint(active, exclude=[bsdf], label="Shadow rays"):
-            u = sampler.next_2d()
-            u.x = (u.x + mi.Float(i)) / mi.Float(count)
-            result += sample_source(scene, ctx, si, bsdf, u, served, active)
-            i += 1
-            active &= i < count
-        result /= mi.Float(count)
-    else:
-        result = sample_source(scene, ctx, si, bsdf, sampler.next_2d(), served, active)
-    return result
+    while dr.hint(active, exclude=[bsdf], label="Shadow rays"):
+        u = sampler.next_2d()
+        u.x = (u.x + mi.Float(i)) / mi.Float(count)
+        ds, em_weight = scene.sample_emitter_direction(si, u, False, active)
+        bsdf_value, bsdf_pdf = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), active)
+        result += reflected_source(
+            scene, si, ds, em_weight, bsdf_value, bsdf_pdf, served, lit, active
+        )
+        i += 1
+        active &= i < count
+    return result / mi.Float(count)
 
 
-def sample_source(scene, ctx, si, bsdf, u, served, active):
-    """One term of ``sample_sources``."""
-    ds, em_weight = scene.sample_emitter_direction(si, u, True, active)
-    active = active & (ds.pdf != 0)
-    wo = si.to_local(ds.d)
-    bsdf_value, bsdf_pdf = bsdf.eval_pdf(ctx, si, wo, active)
-    partner_pdf = dr.select(served & is_wide(si, wo, bsdf_pdf), 0, bsdf_pdf)
-    mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, partner_pdf))
-    return dr.select(active, bsdf_value * em_weight * mis, 0)
+def reflected_source(scene, si, ds, em_weight, bsdf_value, bsdf_pdf, served, lit, active):
+    """Light [W/m²/sr] that a surface reflects from a sampled direction to a source.
+
+    Where the cache serves the surface, wide lobes aren't traced on: their direct light comes from
+    shadow rays alone, or, where the cache has lit the surface already (``lit``), from the cache.
+    """
+    cached = served & is_wide(si, si.to_local(ds.d), bsdf_pdf)
+    mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, dr.select(cached, 0, bsdf_pdf)))
+    light = bsdf_value * em_weight * mis
+    active = active & (ds.pdf != 0) & ~(cached & lit) & (dr.max(light) > 0)
+    active &= ~scene.ray_test(si.spawn_ray_to(ds.p), active)
+    return dr.select(active, light, 0)
+
+
+def only_wide(bsdf):
+    """Are all smooth lobes of a material diffuse reflection, wide by nature?"""
+    flags = bsdf.flags()
+    narrow = mi.BSDFFlags.Glossy | mi.BSDFFlags.DiffuseTransmission
+    return (flags & int(narrow)) == 0
 
 
 def is_wide(si, wo, pdf):

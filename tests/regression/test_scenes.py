@@ -1,0 +1,55 @@
+"""Our scenes and well-known ones, without any parameter: as bright as with ``path``."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import mitsuba as mi
+import pytest
+
+from tests.helpers import SCENES, assert_agree, exactly, load_scene, measure
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+WIDTH, HEIGHT = 64, 48
+#: Scenes of the folder, with parameters that keep the reference free of fireflies.
+OURS = {
+    "paper_room": {},
+    "desk": {},
+    "door_ajar": {},
+    "open": {"glass": "white-glaze"},
+}
+#: Third-party scenes, and the relative error that their pictures' means may have.
+OTHERS = {"cornell-box": 0.02, "staircase2": 0.02, "veach-ajar": 0.05, "living-room-2": 0.05}
+
+
+def assert_like_path(scene, allowed: float = 0.02, spp: int = 256, precision: float = 0.03):
+    hybrid, path = (mi.load_dict({"type": name}) for name in ("envmap_hybrid", "path"))
+    ours = measure(scene, hybrid).overall()
+    assert_agree(ours, measure(scene, path, spp).overall(), allowed, precision)
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_our_scenes(name):
+    assert_like_path(load_scene(SCENES / f"{name}.xml", WIDTH, HEIGHT, **OURS[name]))
+
+
+def test_furnace():
+    scene = load_scene(SCENES / "furnace.xml", WIDTH, HEIGHT)
+    ours = measure(scene, mi.load_dict({"type": "envmap_hybrid"}), spp=128)
+    assert_agree(ours.tiles(8), exactly(1), allowed=0.005)
+
+
+def test_atrium(tmp_path):
+    command = [sys.executable, SCENES / "make_atrium.py", "--triangles", "10000", "--out", tmp_path]
+    subprocess.run([*map(str, command)], check=True)
+    assert_like_path(load_scene(SCENES / "atrium.xml", WIDTH, HEIGHT, data=str(tmp_path)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", OTHERS)
+def test_third_party_scenes(third_party_scene, name):
+    path = third_party_scene(name)
+    scene = mi.load_file(str(path), resx=WIDTH, resy=HEIGHT)
+    assert_like_path(scene, OTHERS[name], spp=512, precision=0.05)

@@ -1,0 +1,180 @@
+"""What is prepared once is used as often as possible, and never when it's out of date."""
+
+from __future__ import annotations
+
+import gc
+import subprocess
+import sys
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from envmap_integrator.radiosity import irradiance
+from tests.helpers import ROOT, camera, cluster, integrator, load, picture, room
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+OURS = ("envmap_hybrid", "one_level_path", "source_selection", "envmap_bake")
+
+
+def two_views() -> mi.Scene:
+    return load(room(other=camera(16, 12, origin=(1, -1.5, 1))))
+
+
+@pytest.fixture(scope="module")
+def scene(variant) -> mi.Scene:
+    return two_views()
+
+
+@pytest.fixture(scope="module")
+def hybrid(variant) -> mi.Integrator:
+    return integrator("envmap_hybrid", desk=cluster("block", "ball"))
+
+
+# ---------------------- Reuse ----------------------
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_other_views_and_seeds_rebuild_nothing(scene, name):
+    renderer = integrator(name)
+    prepared = renderer.prepare(scene)
+    picture(scene, renderer, seed=1)
+    picture(scene, renderer, sensor=1)
+    assert renderer.prepare(scene) is prepared
+
+
+def test_the_same_seed_gives_the_same_picture(scene, hybrid):
+    assert np.array_equal(picture(scene, hybrid, seed=3), picture(scene, hybrid, seed=3))
+
+
+@pytest.mark.parametrize(
+    ("parameter", "value"),
+    [
+        ("ball.bsdf.reflectance.value", [0.1, 0.6, 0.1]),
+        ("lamp.emitter.radiance.value", [1, 2, 3]),
+        ("block.vertex_positions", np.linspace(-1, 1, 72)),
+    ],
+)
+def test_edits_rebuild(parameter, value):
+    scene, renderer = two_views(), integrator("one_level_path")
+    before = renderer.prepare(scene)
+    parameters = mi.traverse(scene)
+    parameters[parameter] = type(parameters[parameter])(value)
+    parameters.update()
+    after = renderer.prepare(scene)
+    assert after is not before
+    assert not np.array_equal(before.cache.table.numpy(), after.cache.table.numpy())
+    assert renderer.prepare(scene) is after
+
+
+def test_an_edited_sensor_rebuilds_nothing():
+    scene, renderer = two_views(), integrator("one_level_path")
+    before = renderer.prepare(scene)
+    parameters = mi.traverse(scene)
+    parameters["sensor.x_fov"] = 30.0
+    parameters.update()
+    assert renderer.prepare(scene) is before
+
+
+def test_scenes_of_the_same_content_share_what_is_prepared(scene, hybrid):
+    prepared = hybrid.prepare(scene)
+    expected = picture(scene, hybrid)
+    again = two_views()
+    assert hybrid.prepare(again) is prepared
+    assert np.array_equal(picture(again, hybrid), expected)
+    assert np.array_equal(picture(scene, hybrid), expected)
+
+
+def test_scenes_of_other_content_do_not(scene):
+    renderer = integrator("one_level_path")
+    other = load(room(ball=None))
+    assert renderer.prepare(scene) is not renderer.prepare(other)
+    expected = picture(other, integrator("one_level_path"))
+    assert np.array_equal(picture(other, renderer), expected)
+
+
+def test_gathering_in_several_launches_changes_only_the_noise(scene, monkeypatch):
+    whole = integrator("one_level_path").prepare(scene).cache.table.numpy()
+    monkeypatch.setattr(irradiance, "MAX_LANES", 1 << 16)
+    parts = integrator("one_level_path").prepare(scene).cache.table.numpy()
+    assert parts.shape == whole.shape
+    assert parts.mean() == pytest.approx(whole.mean(), rel=0.02)
+
+
+# ---------------------- Files ----------------------
+
+LOAD_AND_RENDER = """
+import sys
+import envmap_integrator
+import mitsuba as mi
+import numpy as np
+mi.set_variant("llvm_ad_rgb")
+from tests.helpers import cluster, integrator, picture
+from tests.system.test_preparation import two_views
+cache_file, output = sys.argv[1:]
+hybrid = integrator("envmap_hybrid", desk=cluster("block", "ball"), cache_file=cache_file)
+np.save(output, picture(two_views(), hybrid, seed=5))
+"""
+
+
+def test_a_saved_state_renders_the_same_bits_in_a_new_process(scene, hybrid, tmp_path):
+    cache_file, output = tmp_path / "state.exr", tmp_path / "picture.npy"
+    hybrid.prepare(scene).save(cache_file)
+    command = [sys.executable, "-c", LOAD_AND_RENDER, str(cache_file), str(output)]
+    subprocess.run(command, check=True, cwd=ROOT)
+    assert np.array_equal(np.load(output), picture(scene, hybrid, seed=5))
+
+
+def test_a_failed_save_leaves_no_file(scene, tmp_path):
+    with pytest.raises(ValueError, match="make it first"):
+        integrator("one_level_path").prepare(scene).save(tmp_path / "nowhere" / "state.exr")
+    assert list(tmp_path.iterdir()) == []
+
+
+# ---------------------- Kernels ----------------------
+
+
+def kernels(scene, seed=0, spp=16, **settings) -> set:
+    """Hashes of the kernels that preparation and rendering launch."""
+    gc.collect()  # Virtual calls reach all objects that are alive.
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        settings = {"desk": cluster("block", "ball")} | settings
+        picture(scene, integrator("envmap_hybrid", **settings), spp, seed)
+        return {entry["hash"] for entry in dr.kernel_history([dr.KernelType.JIT])}
+
+
+@pytest.fixture(scope="module")
+def compiled(scene):
+    return kernels(scene) | kernels(scene)
+
+
+def test_a_second_render_compiles_nothing(scene):
+    renderer = integrator("envmap_hybrid", desk=cluster("block", "ball"))
+    renderer.prepare(scene)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        first, second = set(), set()
+        for seed, hashes in enumerate((first, second)):
+            dr.kernel_history_clear()
+            picture(scene, renderer, seed=seed)
+            hashes |= {entry["hash"] for entry in dr.kernel_history([dr.KernelType.JIT])}
+    assert first and second <= first
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"seed": 1},
+        {"seed": 2},
+        {"spp": 32},
+        {"spp": 4},
+        {"mip_bias": 0.5},
+        {"mip_bias": -1.0},
+        {"desk": {"type": "mipmap_cube", "shapes": "block, ball", "distance_ratio": 2.25}},
+    ],
+    ids=lambda change: "-".join(change),
+)
+def test_a_changed_number_compiles_nothing(scene, compiled, change):
+    assert kernels(scene, **change) <= compiled

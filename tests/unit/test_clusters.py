@@ -1,0 +1,162 @@
+"""Clusters: found among the surface points of a scene, or listed by the user."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from envmap_integrator.maps.clusters import (
+    ClusterRequest,
+    cluster_of_cell,
+    find_clusters,
+    listed_clusters,
+)
+from envmap_integrator.radiosity.surface_points import SurfacePoints
+from tests.helpers import ball
+from tests.unit.kit import scene_of, surface_points
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+RATIO = 2.0
+LEFT, RIGHT = np.array([-5.0, 0, 1]), np.array([5.0, 1, 1])
+
+
+def floor(seen=1.0) -> SurfacePoints:
+    """20 x 20, at z = 0, object 0."""
+    x = np.linspace(-10, 10, 60)
+    position = np.stack([*np.meshgrid(x, x), np.zeros((60, 60))], axis=-1).reshape(-1, 3)
+    return surface_points(position, [0, 0, 1], object_id=0, seen=seen)
+
+
+def globe(centre, object_id: int, radius: float = 1.0, seen=1.0) -> SurfacePoints:
+    normal = np.random.default_rng(object_id).normal(size=(500, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    return surface_points(centre + radius * normal, normal, object_id, seen)
+
+
+def hall(**more) -> SurfacePoints:
+    """Two globes far apart over a large floor."""
+    return SurfacePoints.concatenate(
+        [floor(**more), globe(LEFT, 1, **more), globe(RIGHT, 2, **more)]
+    )
+
+
+# ---------------------- Automatic ----------------------
+
+
+def test_objects_far_apart_are_clusters_and_the_floor_is_none():
+    points = hall()
+    clusters, cluster_of_point = find_clusters(points, RATIO)
+    assert len(clusters) == 2
+    assert (cluster_of_point[points.object_id == 0] == -1).all()
+    for object_id, centre in ((1, LEFT), (2, RIGHT)):
+        (index,) = set(cluster_of_point[points.object_id == object_id])
+        cluster = clusters[index]
+        assert cluster.centre == pytest.approx(centre, abs=0.05)
+        assert cluster.radius == pytest.approx(1, abs=0.05)
+        assert cluster.half_width == pytest.approx(RATIO * cluster.radius)
+
+
+def test_cubes_hold_their_cluster():
+    points = hall()
+    clusters, cluster_of_point = find_clusters(points, 1.0)
+    assert clusters
+    for index, cluster in enumerate(clusters):
+        offset = np.abs(points.position[cluster_of_point == index] - cluster.centre).max()
+        assert offset == pytest.approx(cluster.half_width, rel=1e-5)
+
+
+def test_what_no_sensor_sees_gets_no_map():
+    assert find_clusters(hall(seen=0.0), RATIO)[0] == []
+
+
+def test_a_floor_alone_has_no_cluster():
+    clusters, cluster_of_point = find_clusters(floor(), RATIO)
+    assert clusters == [] and (cluster_of_point == -1).all()
+
+
+def test_a_cube_that_holds_the_whole_scene_is_no_cluster():
+    clusters, cluster_of_point = find_clusters(globe(LEFT, 0), distance_ratio=20)
+    assert clusters == [] and (cluster_of_point == -1).all()
+
+
+@pytest.mark.parametrize(("scale", "shift"), [(1e-4, 0.0), (1e5, 0.0), (1.0, 1e4)])
+def test_clusters_depend_neither_on_scale_nor_on_place(scale, shift):
+    points = hall()
+    moved = SurfacePoints(
+        (points.position.astype(np.float64) * scale + shift).astype(np.float32),
+        points.normal,
+        points.shading_normal,
+        points.object_id,
+        points.seen,
+    )
+    here, there = find_clusters(points, RATIO)[0], find_clusters(moved, RATIO)[0]
+    assert len(here) == len(there)
+    radii = sorted(cluster.radius * scale for cluster in here)
+    assert sorted(cluster.radius for cluster in there) == pytest.approx(radii, rel=0.02)
+
+
+# ---------------------- Listed ----------------------
+
+
+@pytest.fixture(scope="module")
+def scene(variant) -> mi.Scene:
+    """Whose shapes are called as its objects here: 0, 1, 2."""
+    names = ("floor", "left", "right")
+    return mi.load_dict({"type": "scene"} | {name: ball(0, 0, 0, 1) for name in names})
+
+
+def listed(scene, *requests: ClusterRequest):
+    return listed_clusters(hall(), scene, requests, RATIO)
+
+
+def test_listed_shapes_make_clusters(scene):
+    both = ClusterRequest("globes", ("left", "right"), None)
+    (cluster,), cluster_of_point = listed(scene, both)
+    points = hall()
+    assert cluster.name == "globes"
+    assert cluster.centre == pytest.approx((LEFT + RIGHT) / 2, abs=0.05)
+    assert cluster.half_width == pytest.approx(RATIO * cluster.radius)
+    assert np.array_equal(cluster_of_point, np.where(points.object_id > 0, 0, -1))
+
+
+def test_a_request_may_have_its_own_ratio(scene):
+    requests = (ClusterRequest("a", ("left",), 7.0), ClusterRequest("b", ("right",), None))
+    ratios = [cluster.half_width / cluster.radius for cluster in listed(scene, *requests)[0]]
+    assert ratios == pytest.approx([7, RATIO])
+
+
+@pytest.mark.parametrize(
+    ("requests", "message"),
+    [
+        ([("desk", "lef")], 'mipmap_cube "desk": the scene has no shape "lef"; it has .*"left"'),
+        ([("desk", "left", "left")], 'mipmap_cube "desk": shape "left" is listed twice'),
+        ([("a", "left"), ("b", "left")], 'mipmap_cube "b": shape "left" is listed twice'),
+    ],
+)
+def test_wrong_requests_are_named(scene, requests, message):
+    requests = [ClusterRequest(name, tuple(ids), None) for name, *ids in requests]
+    with pytest.raises(ValueError, match=message):
+        listed(scene, *requests)
+
+
+def test_a_shape_without_surface_is_named(scene):
+    with pytest.raises(ValueError, match='mipmap_cube "desk": no surface was found on "right"'):
+        listed_clusters(floor(), scene, (ClusterRequest("desk", ("right",), None),), RATIO)
+
+
+def test_long_lists_of_shapes_are_cut():
+    scene = scene_of(*(ball(i, 0, 0, 0.1) for i in range(20)))
+    with pytest.raises(ValueError, match=r'"shape7", … \(20 in all\)'):
+        listed_clusters(floor(), scene, (ClusterRequest("desk", ("cup",), None),), RATIO)
+
+
+# ---------------------- Cells of the coarse mesh ----------------------
+
+
+def test_cells_take_the_cluster_of_most_of_their_points():
+    """A cell of two clusters, one of one, one of none, one half of none; a point without a cell."""
+    cluster_of_point = np.array([0, 1, 1, 0, 0, -1, -1, -1, 0, 1])
+    cell_of_point = np.array([0, 0, 0, 1, 1, 2, 3, 3, 3, -1])
+    assert cluster_of_cell(2, cluster_of_point, cell_of_point, 4).tolist() == [1, 0, 2, 2]
