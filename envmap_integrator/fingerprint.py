@@ -49,7 +49,8 @@ def _parameters(scene: mi.Scene) -> tuple[tuple, str]:
         for name, value in mi.traverse(item):
             if dr.is_array_v(value) and dr.is_jit_v(value):
                 scalars.append(name)
-                arrays.append(value)
+                # The value itself, not the scene's variable, which edits replace.
+                arrays.append(type(value)(value))
             else:
                 scalars.append(f"{name}={value}")
     return tuple(arrays), "\n".join(scalars)

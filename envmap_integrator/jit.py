@@ -11,3 +11,28 @@ def opaque_point(values) -> mi.Point3f:
     point = mi.Point3f(*(float(value) for value in values))
     dr.make_opaque(point)
     return point
+
+
+def mix(h: mi.UInt32) -> mi.UInt32:
+    """Finaliser of MurmurHash3: every input bit affects every output bit."""
+    h = (h ^ (h >> 16)) * 0x85EBCA6B
+    h = (h ^ (h >> 13)) * 0xC2B2AE35
+    return h ^ (h >> 16)
+
+
+class SpareNumbers:
+    """Uniform random numbers where quality hardly matters, many from one sample of the sampler.
+
+    A 32 bit hash costs a fraction of a step of the samplers' 64 bit generators.
+    """
+
+    def __init__(self, sample: mi.Float):
+        self._bits = mi.UInt32(sample * 16777216.0)
+        self._count = 0
+
+    def next_1d(self) -> mi.Float:
+        self._count += 1
+        return mi.Float(mix(self._bits + self._count * 0x9E3779B1 % 2**32) >> 8) / 16777216.0
+
+    def next_2d(self) -> mi.Point2f:
+        return mi.Point2f(self.next_1d(), self.next_1d())

@@ -95,10 +95,11 @@ def find_clusters(
     Returns the clusters and the cluster of every surface point [N], -1 if it belongs to none.
     """
     cluster_of_point = np.full(len(points), -1)
-    low, high = np.percentile(points.position, [2, 98], axis=0)
-    extent = max(float(np.linalg.norm(high - low)), 1e-30)
+    if points.seen.sum() == 0:
+        return [], cluster_of_point
+    _, extent = points.bounds()
     contents = np.flatnonzero(~_on_large_plane(points, extent))
-    if len(contents) == 0 or points.seen.sum() == 0:
+    if len(contents) == 0:
         return [], cluster_of_point
 
     # ---- Voxels of what isn't surroundings ----
@@ -138,7 +139,8 @@ def cluster_of_cell(
 ) -> np.ndarray:
     """Cluster of every large cell of the coarse mesh, ``n_clusters`` where it belongs to none.
 
-    A cell belongs to the cluster that most of its surface points belong to.
+    A cell belongs to the cluster that most of its surface points belong to; slots of the table
+    without a cell count for nothing.
     """
     votes = np.zeros((n_cells, n_clusters + 1), dtype=np.int64)
     known = cell_of_point >= 0

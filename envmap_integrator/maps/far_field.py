@@ -23,6 +23,20 @@ HAND_OFF = 0.1
 
 
 @dataclass(frozen=True)
+class Cube:
+    """A lane's cube: index of its cluster, centre, half width [world units], whether there is one."""
+
+    cluster: mi.UInt32
+    centre: mi.Point3f
+    half_width: mi.Float
+    valid: mi.Bool
+
+    def exit(self, o, d):
+        """Distance along a ray from inside to the cube's surface, infinite if there is no cube."""
+        return dr.select(self.valid, exit_distance(self.centre, self.half_width, o, d), dr.inf)
+
+
+@dataclass(frozen=True)
 class FarField:
     """Radiance and distance beyond the cubes of all clusters.
 
@@ -35,7 +49,7 @@ class FarField:
     mip_bias           [1]       levels added to the look-up
     map_mirrors        whether mirrors and lobes finer than texels read the map (else traced)
     corrected          whether look-ups use the distance (else the bare direction, as the paper)
-    sources            scene of the emitters' shapes alone
+    sources            scene of the emitters' shapes alone, None if no ray needs to look for them
     has_environment    whether the scene has an environment emitter
     """
 
@@ -51,22 +65,30 @@ class FarField:
     sources: mi.Scene | None
     has_environment: bool
 
-    def bound(self, cell, ray, pdf, specular, u, active):
-        """Bound a ray that starts in a cell of the coarse mesh by the cube of the cell's cluster.
+    def cube(self, cell, p, active):
+        """The cube whose map serves rays from a point in a cell of the coarse mesh.
 
-        Returns ``(cluster, bounded, maxt)``. Rays from outside their cube and lobes too narrow
-        for the map's texels aren't bounded.
+        None where the cell belongs to no cluster or the point isn't in the cluster's cube.
         """
         cluster = dr.gather(mi.UInt32, self.cluster_of_cell, cell, active)
-        bounded = active & (cluster < self.n_clusters)
+        active = active & (cluster < self.n_clusters)
+        cube = dr.gather(mi.Vector4f, self.cubes, cluster, active)
+        centre, half_width = mi.Point3f(cube.x, cube.y, cube.z), cube.w
+        active &= dr.all(dr.abs(p - centre) < half_width)
+        return Cube(cluster, centre, half_width, active)
+
+    def bound(self, cube, ray, pdf, wide, specular, u, active):
+        """Bound secondary rays by their cube: ``(bounded, maxt, reach)``.
+
+        Lobes too narrow for the map's texels aren't bounded. Rays are traced a little farther than
+        the cube, but wide lobes count only the sources that they hit inside (``reach``).
+        """
         texel_solid_angle = 4 / dr.square(mi.Float(self.resolution))
-        if not self.map_mirrors:
-            bounded &= ~specular & (pdf * texel_solid_angle * MIN_LOBE_TEXELS < 1)
-        centre, half_width = self._cube(cluster, bounded)
-        t = exit_distance(centre, half_width, ray.o, ray.d)
-        bounded &= t > 0
-        t *= 1 + HAND_OFF * u
-        return cluster, bounded, dr.select(bounded, t, dr.largest(mi.Float))
+        resolved = ~specular & (pdf * texel_solid_angle * MIN_LOBE_TEXELS < 1)
+        t = cube.exit(ray.o, ray.d)
+        bounded = active & (wide | resolved | self.map_mirrors) & (t > 0) & (t < dr.inf)
+        maxt = dr.select(bounded, t * (1 + HAND_OFF * u), dr.largest(mi.Float))
+        return bounded, maxt, dr.select(bounded & wide, t, dr.inf)
 
     def eval(self, cluster, o, d, pdf, specular, u_level, u_texel, active):
         """Far radiance along rays that have left their cube, from the prefiltered map.
@@ -75,7 +97,8 @@ class FarField:
         a texel covers what the sample stands for (paper section 2, Figure 4; Křivánek and Colbert
         2008): 1 / (N pdf) sr, as seen from the cube's centre.
         """
-        centre, _ = self._cube(cluster, active)
+        cube = dr.gather(mi.Vector4f, self.cubes, cluster, active)
+        centre = mi.Point3f(cube.x, cube.y, cube.z)
         far = mi.Vector3f(d)
         trusted = mi.Bool(True)
         footprint = mi.Float(1)
@@ -120,21 +143,11 @@ class FarField:
         Cheap and exact: the ray meets a scene of emitters only, and visibility is tested where it
         hits one. Returns a surface interaction (invalid for the environment) and its visibility.
         """
-        if self.sources is None:
-            si = dr.zeros(mi.SurfaceInteraction3f)
-            si.t = dr.inf
-            si.wi = -ray.d
-            found = active & self.has_environment
-        else:
-            si = self.sources.ray_intersect(ray, active)
-            found = active & (si.is_valid() | self.has_environment)
+        si = self.sources.ray_intersect(ray, active)
+        found = active & (si.is_valid() | self.has_environment)
         ray = mi.Ray3f(ray)
         ray.maxt = dr.select(si.is_valid(), si.t * (1 - 1e-4), dr.largest(mi.Float))
         return si, found & ~scene.ray_test(ray, found)
-
-    def _cube(self, cluster, active):
-        cube = dr.gather(mi.Vector4f, self.cubes, cluster, active)
-        return mi.Point3f(cube.x, cube.y, cube.z), cube.w
 
     def _inverse_distance(self, cluster, d, active):
         face, uv = direction_to_face(d)
@@ -169,21 +182,38 @@ def far_field(
         mip_bias=dr.opaque(mi.Float, mip_bias),
         corrected=corrected,
         map_mirrors=map_mirrors,
-        sources=_source_scene(scene),
+        sources=_source_scene(scene, map_mirrors),
         has_environment=scene.environment() is not None,
     )
 
 
-def _source_scene(scene: mi.Scene) -> mi.Scene | None:
-    """A scene of the emitters' shapes alone."""
-    shapes = [shape for shape in scene.shapes() if shape.is_emitter()]
-    if not shapes:
+def _source_scene(scene: mi.Scene, map_mirrors: bool) -> mi.Scene | None:
+    """A scene of the emitters' shapes alone; None if only wide lobes read the maps.
+
+    Under those, shadow rays alone account for the sources beyond a cube.
+    """
+    if not map_mirrors and not any(map(_may_be_narrow, scene.shapes())):
         return None
+    shapes = [shape for shape in scene.shapes() if shape.is_emitter()]
+    # An empty scene can't be traced; a point far outside every cube stands for it.
+    nowhere = {"type": "sphere", "radius": 1e-30, "center": [1e30, 1e30, 1e30]}
     ids = [shape.id() for shape in shapes]
-    sources = mi.load_dict({"type": "scene"} | {f"shape{i}": s for i, s in enumerate(shapes)})
+    sources = mi.load_dict(
+        {"type": "scene", "nowhere": nowhere} | {f"shape{i}": s for i, s in enumerate(shapes)}
+    )
     for shape, id_ in zip(shapes, ids, strict=True):  # Loading has renamed them.
         shape.set_id(id_)
     return sources
+
+
+def _may_be_narrow(shape: mi.Shape) -> bool:
+    """Whether a shape may have lobes that are narrower than a diffuse one, but not perfect mirrors.
+
+    The materials within an instance can't be asked.
+    """
+    bsdf = shape.bsdf()
+    narrow = mi.BSDFFlags.Glossy | mi.BSDFFlags.DiffuseTransmission
+    return bsdf is None or bool(bsdf.flags() & int(narrow))
 
 
 def texel_type():

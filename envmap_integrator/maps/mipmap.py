@@ -16,7 +16,7 @@ def build_levels(value: np.ndarray, weight: np.ndarray) -> list[np.ndarray]:
              angle and trust (pull); texels without any trust take over from the coarser level
              (push), those of a whole face from the other faces.
     """
-    values, weights = [value], [weight * solid_angles(value.shape[1])]
+    values, weights = [value.copy()], [weight * solid_angles(value.shape[1])]
     while values[-1].shape[1] > 1:
         v, w = _halve(values[-1] * weights[-1][..., None]), _halve(weights[-1][..., None])
         values.append(np.divide(v, w, out=np.zeros_like(v), where=w > 0))

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ..rendering.transport import Transport
 
 #: Relative change of the irradiance at which the solution counts as converged.
-TOLERANCE = 1e-4
+TOLERANCE = 1e-5
 MAX_ITERATIONS = 256
 #: Gather rays per kernel launch: bounds memory.
 MAX_LANES = 1 << 22
@@ -65,6 +65,11 @@ def solve_irradiance(
     patches, first = np.unique(patch_of_point[order], return_index=True)
     first = np.append(first, len(order))
     points = points.take(order)
+
+    if len(patches) == 0:  # Nothing but mirrors and glass.
+        n_channels = len(mi.Spectrum())
+        table = dr.zeros(mi.Float, 2 * transport.patches.count * n_channels)
+        return IrradianceCache(transport.patches, table)
 
     launch = max(MAX_LANES // samples, 1)
     parts = []
@@ -153,6 +158,7 @@ def _gather(scene, transport, points, first, begin, end, samples, seed):
         specular=mi.Bool(False),
         bounded=mi.Bool(False),
         cluster=mi.UInt32(0),
+        reach=mi.Float(dr.inf),
     )
     above = (dr.dot(normal, direction) > 0) & (wo.z > 0)
     end_ = follow(scene, transport, sampler, start, above)

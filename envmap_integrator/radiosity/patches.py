@@ -15,15 +15,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..jit import opaque_point
+from ..jit import mix, opaque_point
 from .surface_points import ObjectIds, SurfacePoints
 
 #: Edge of the large cells as a fraction of the diagonal of the box that holds most surface points,
 #: and how often they may be halved. Patches are at most half as large.
 LARGE_CELL = 1 / 16
 MAX_LEVEL = 7
-#: Patches with fewer surface points than this aren't trusted with an irradiance.
-MIN_POINTS = 2
 #: Entries of a bucket of the hash tables, read by one packed gather.
 BUCKET = 4
 #: Bits of an entry of the large cells' table that hold the level.
@@ -139,16 +137,9 @@ def cell_hash(cell, identity, level):
     """
     c = dr.reinterpret_array(mi.Vector3u, cell)
     name = identity * 16 + level
-    slot = _mix(c.x * 0x8DA6B343 + c.y * 0xD8163841 + c.z * 0xCB1AB31F + name * 0x9E3779B1)
-    fingerprint = _mix(c.x * 0xC2B2AE3D + c.y * 0x27D4EB2F + c.z * 0x165667B1 + name * 0x85EBCA77)
+    slot = mix(c.x * 0x8DA6B343 + c.y * 0xD8163841 + c.z * 0xCB1AB31F + name * 0x9E3779B1)
+    fingerprint = mix(c.x * 0xC2B2AE3D + c.y * 0x27D4EB2F + c.z * 0x165667B1 + name * 0x85EBCA77)
     return slot, fingerprint | (1 << _LEVEL_BITS)
-
-
-def _mix(h):
-    """Finaliser of MurmurHash3: every input bit affects every output bit."""
-    h = (h ^ (h >> 16)) * 0x85EBCA6B
-    h = (h ^ (h >> 13)) * 0xC2B2AE35
-    return h ^ (h >> 16)
 
 
 def build_patches(
@@ -159,10 +150,10 @@ def build_patches(
     Returns the patches and, of every point, the patch index and the large cell's [N], -1 where
     it has none.
     """
-    low, high = np.percentile(points.position, [2, 98], axis=0)
-    size = max(float(np.linalg.norm(high - low)) * LARGE_CELL, 1e-30)
+    low, extent = points.bounds()
+    size = extent * LARGE_CELL
     # An irrational offset keeps walls, mostly at round coordinates, off the cell borders.
-    origin = points.position.min(axis=0) - size * np.array([0.3819, 0.4142, 0.2361])
+    origin = low - size * np.array([0.3819, 0.4142, 0.2361])
     patches = Patches(
         origin=opaque_point(origin),
         size=dr.opaque(mi.Float, size),
@@ -178,7 +169,7 @@ def build_patches(
     # ---- Large cells choose their level by their number of points ----
     key = _keys(patches, position, identity, mi.UInt32(0))
     large, cell_of_point, n_points = np.unique(key, return_inverse=True, return_counts=True)
-    level = np.ceil(0.5 * np.log2(np.maximum(n_points * budget / len(points), 1)))
+    level = np.floor(0.5 * np.log2(np.maximum(n_points * (budget / max(len(points), 1)), 1)))
     level = np.clip(level - 1, 0, MAX_LEVEL).astype(np.uint64)
     payload = np.uint64((1 << _LEVEL_BITS) - 1)
     levels, index_of_large = _hash_table((large & ~payload) | level)
@@ -187,12 +178,9 @@ def build_patches(
     # ---- Their cells are the patches ----
     level_of_point = mi.UInt32(level[cell_of_point].astype(np.uint32) + 1)
     key = _keys(patches, position, identity, level_of_point)
-    cells, cell_of_point, n_points = np.unique(key, return_inverse=True, return_counts=True)
-    kept = n_points >= MIN_POINTS
-    table, index = _hash_table(cells[kept])
-    patch_of_cell = np.full(len(cells), -1)
-    patch_of_cell[kept] = index
-    patches = replace(patches, levels=mi.UInt32(levels), cells=mi.UInt32(table))
+    cells, cell_of_point = np.unique(key, return_inverse=True)
+    cells, patch_of_cell = _hash_table(cells)
+    patches = replace(patches, levels=mi.UInt32(levels), cells=mi.UInt32(cells))
     return patches, patch_of_cell[cell_of_point], large_of_point
 
 

@@ -14,6 +14,8 @@ import numpy as np
 
 #: Hits followed along each global line, and along each walk from a sensor.
 LINE_HITS, WALK_HITS = 8, 4
+#: Batches of rays cast at most to find as many points as asked for.
+MAX_BATCHES = 8
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,13 @@ class SurfacePoints:
 
     def __len__(self) -> int:
         return len(self.position)
+
+    def bounds(self) -> tuple[np.ndarray, float]:
+        """Lowest corner [3] of all points, and the diagonal of the box that holds most of them."""
+        if len(self) == 0:
+            return np.zeros(3), 1.0
+        low, high = np.percentile(self.position, [2, 98], axis=0)
+        return self.position.min(axis=0), max(float(np.linalg.norm(high - low)), 1e-30)
 
     def take(self, index: np.ndarray) -> SurfacePoints:
         """The points of the given indices, in that order."""
@@ -82,20 +91,22 @@ def scatter_points(
     """
     sampler = mi.load_dict({"type": "independent"})
     sensors = scene.sensors()
-    parts = []
-
-    n_walks = count // (2 * WALK_HITS)
-    for index, sensor in enumerate(sensors):
-        n = max(n_walks // len(sensors), 1)
-        sampler.seed(seed * 1009 + index + 1, n)
-        ray = _sensor_rays(sensor, sampler)
-        parts += _hits_along(scene, object_ids, sampler, ray, WALK_HITS, bounce=True)
-
-    n_lines = (count if not sensors else count // 2) // (LINE_HITS // 2)
-    sampler.seed(seed * 1009, n_lines)
-    ray = _global_lines(scene, sampler)
-    parts += _hits_along(scene, object_ids, sampler, ray, LINE_HITS, bounce=False)
-    return SurfacePoints.concatenate(parts)
+    n_walks = max(count // (2 * WALK_HITS * max(len(sensors), 1)), 1)
+    n_lines = max((count // 2 if sensors else count) // LINE_HITS, 1)
+    lines, walks = [], []
+    for batch in range(MAX_BATCHES):
+        # Rays miss open scenes and leave them early: go on until there are enough hits.
+        seed_ = MAX_BATCHES * seed + batch
+        if sum(map(len, walks)) < count // 2:
+            for index, sensor in enumerate(sensors):
+                sampler.seed(1009 * seed_ + index + 1, n_walks)
+                ray = _sensor_rays(sensor, sampler)
+                walks += _hits_along(scene, object_ids, sampler, ray, WALK_HITS, bounce=True)
+        if sum(map(len, lines)) < (count // 2 if sensors else count):
+            sampler.seed(1009 * seed_, n_lines)
+            ray = _global_lines(scene, sampler)
+            lines += _hits_along(scene, object_ids, sampler, ray, LINE_HITS, bounce=False)
+    return SurfacePoints.concatenate(walks + lines)
 
 
 def _sensor_rays(sensor: mi.Sensor, sampler: mi.Sampler) -> mi.Ray3f:

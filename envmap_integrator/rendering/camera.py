@@ -9,17 +9,19 @@ import mitsuba as mi
 
 from ..radiosity.irradiance import IrradianceCache
 from .transport import (
+    PathEnd,
     PathState,
     Transport,
+    Vertex,
     camera_path,
     facing,
     follow,
+    is_wide,
     sample_sources,
     skip_sources,
 )
 
 
-@dr.syntax
 def camera_radiance(
     scene: mi.Scene,
     transport: Transport,
@@ -31,14 +33,27 @@ def camera_radiance(
 ) -> tuple[mi.Spectrum, mi.Float, mi.Bool]:
     """Radiance [W/m²/sr] along rays, distance to the first hit, whether there was one.
 
-    With several secondary samples the first hit is shaded once and paths split there.
+    Where the cache may end a path at once (``gather_depth`` 0) there are no secondary rays.
     """
-    if dr.hint(secondary_samples == 1, mode="scalar"):
+    if transport.gather_depth == 0:
         end = follow(scene, transport, sampler, camera_path(ray), active)
-        radiance = end.radiance + end.weight * cache.irradiance(end.row) * dr.inv_pi
-        return radiance, end.distance, end.valid
+        return total(end, cache), end.distance, end.valid
+    return split(scene, transport, cache, sampler, ray, active, secondary_samples)
 
-    # ---------------------- First vertex, shaded once ----------------------
+
+def total(end: PathEnd, cache: IrradianceCache) -> mi.Spectrum:
+    """Radiance [W/m²/sr] of a path, with what it found in the cache."""
+    return end.radiance + end.weight * cache.irradiance(end.row) * dr.inv_pi
+
+
+@dr.syntax
+def split(scene, transport, cache, sampler, ray, active, secondary_samples):
+    """Shade the first hit once and send secondary rays from it.
+
+    The first vertex stands outside the loop over the others also for a single secondary ray: it
+    needs no patch and those need hardly any shadow rays, which saves a fifth of the time.
+    """
+    # ---------------------- First vertex ----------------------
 
     pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
     if dr.hint(transport.hide_emitters, mode="scalar"):
@@ -47,38 +62,47 @@ def camera_radiance(
     hit = active & si.is_valid()
     bsdf = si.bsdf(ray)
     smooth = hit & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-    cell, _, found = transport.patches.find_cell(
-        si.p, facing(si, ray), transport.object_ids(si), smooth
-    )
+    cube = None
+    if dr.hint(transport.far_field is not None, mode="scalar"):
+        object_id = transport.object_ids(si)
+        cell, _, found = transport.patches.find_cell(si.p, facing(si, ray), object_id, smooth)
+        cube = transport.far_field.cube(cell, si.p, found)
+    vertex = Vertex(si, bsdf, mi.Bool(False), mi.Bool(False), cube)
 
     emitted = si.emitter(scene).eval(si, active & (not transport.hide_emitters))
-    nowhere = mi.Bool(False)
+    n_shadow = transport.shadow_samples
     radiance = emitted + sample_sources(
-        scene, si, bsdf, sampler, mi.UInt32(transport.shadow_samples), nowhere, nowhere, smooth
+        scene, vertex, sampler, mi.UInt32(n_shadow), n_shadow > 1, smooth
     )
 
-    # ---------------------- Secondary rays, stratified ----------------------
+    # ---------------------- Secondary rays ----------------------
 
-    ctx = mi.BSDFContext()
     beyond = replace(transport, hide_emitters=False)
-    valid = ~si.is_valid() & (scene.environment() is not None and not transport.hide_emitters)
-    sum_ = mi.Spectrum(0)
-    i = mi.UInt32(0)
-    pending = mi.Bool(hit)
-    while dr.hint(pending, exclude=[transport, beyond, cache, bsdf], label="Secondary rays"):
-        u = (mi.Float(i) + sampler.next_1d()) / mi.Float(secondary_samples)
-        bs, weight = bsdf.sample(ctx, si, u, sampler.next_2d(), pending)
-        start = leave(transport, sampler, si, bs, cell, found)
-        end = follow(scene, beyond, sampler, start, pending & (dr.max(weight) > 0))
-        sum_ += weight * (end.radiance + end.weight * cache.irradiance(end.row) * dr.inv_pi)
-        valid |= end.valid | (pending & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null))
-        i += 1
-        pending &= i < secondary_samples
-    return radiance + sum_ / secondary_samples, si.t, valid
+    valid = active & (scene.environment() is not None and not transport.hide_emitters)
+    if dr.hint(secondary_samples == 1, mode="scalar"):
+        u = sampler.next_1d()
+        arriving, solid = secondary(scene, beyond, cache, sampler, vertex, u, hit)
+        radiance += arriving
+        valid |= solid
+    else:
+        i = mi.UInt32(0)
+        arriving = mi.Spectrum(0)
+        pending = mi.Bool(hit)
+        while dr.hint(pending, exclude=[beyond, cache, vertex], label="Secondary rays"):
+            u = (mi.Float(i) + sampler.next_1d()) / mi.Float(secondary_samples)
+            one, solid = secondary(scene, beyond, cache, sampler, vertex, u, pending)
+            arriving += one
+            valid |= pending & solid
+            i += 1
+            pending &= i < secondary_samples
+        radiance += arriving / secondary_samples
+    return radiance, dr.select(hit, si.t, dr.inf), valid
 
 
-def leave(transport, sampler, si, bs, cell, found):
-    """The path that leaves a camera hit in a sampled direction."""
+def secondary(scene, transport, cache, sampler, vertex, u, active):
+    """One secondary ray: radiance [W/m²/sr] that it brings, and whether the surface is solid."""
+    si = vertex.si
+    bs, weight = vertex.bsdf.sample(mi.BSDFContext(), si, u, sampler.next_2d(), active)
     specular = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     start = PathState(
         ray=si.spawn_ray(si.to_world(bs.wo)),
@@ -88,9 +112,14 @@ def leave(transport, sampler, si, bs, cell, found):
         specular=specular,
         bounded=mi.Bool(False),
         cluster=mi.UInt32(0),
+        reach=mi.Float(dr.inf),
     )
-    if transport.far_field is not None:
-        start.cluster, start.bounded, start.ray.maxt = transport.far_field.bound(
-            cell, start.ray, bs.pdf, specular, sampler.next_1d(), found
+    if vertex.cube is not None:
+        wide = is_wide(si, bs.wo, bs.pdf) & ~specular
+        start.cluster = vertex.cube.cluster
+        start.bounded, start.ray.maxt, start.reach = transport.far_field.bound(
+            vertex.cube, start.ray, bs.pdf, wide, specular, sampler.next_1d(), active
         )
-    return start
+    end = follow(scene, transport, sampler, start, active & (dr.max(weight) > 0))
+    solid = active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+    return weight * total(end, cache), end.valid | solid

@@ -22,7 +22,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..maps.far_field import FarField
+from ..jit import SpareNumbers
+from ..maps.far_field import Cube, FarField
 from ..radiosity.irradiance import IrradianceCache
 from ..radiosity.patches import Patches
 from ..radiosity.surface_points import ObjectIds
@@ -67,7 +68,9 @@ class PathState:
     depth           non-specular bounces behind it
     origin          the vertex it comes from, for the MIS weight of the sources it hits
     pdf, specular   density [1/sr] with which the direction was sampled; no density if specular
-    bounded         whether ``ray.maxt`` ends it at the cube ``cluster``
+    bounded         whether ``ray.maxt`` ends it at the cube of ``cluster``
+    reach           distance [world units] up to which the ray counts the sources that it hits;
+                    shadow rays alone count those beyond
     """
 
     ray: mi.Ray3f
@@ -77,6 +80,7 @@ class PathState:
     specular: mi.Bool
     bounded: mi.Bool
     cluster: mi.UInt32
+    reach: mi.Float
 
 
 @dataclass
@@ -116,6 +120,7 @@ def camera_path(ray: mi.Ray3f) -> PathState:
         specular=mi.Bool(True),
         bounded=mi.Bool(False),
         cluster=mi.UInt32(0),
+        reach=mi.Float(dr.inf),
     )
 
 
@@ -144,6 +149,7 @@ def follow(
     specular = mi.Bool(start.specular)  # ... whether sources weren't sampled for it
     bounded = mi.Bool(start.bounded)  # Does the ray end where it leaves its cube?
     cluster = mi.UInt32(start.cluster)
+    reach = mi.Float(start.reach)  # Sources hit farther away have been counted
     throughput = mi.Spectrum(1)
     eta = mi.Float(1)
     radiance = mi.Spectrum(0)
@@ -160,6 +166,7 @@ def follow(
     ):
         # ---------------------- Trace near ----------------------
 
+        spare = SpareNumbers(sampler.next_1d())
         pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
         if dr.hint(hide_emitters, mode="scalar"):
             pi = skip_sources(scene, ray, pi, active & (bounces == 0))
@@ -171,19 +178,21 @@ def follow(
 
         retrace = mi.Bool(False)
         source_si = si
-        source_active = mi.Bool(active)
+        source_active = active & (si.t <= reach)
         if dr.hint(far_field is not None, mode="scalar"):
             left = active & bounded & ~si.is_valid()
             far_radiance, trusted = far_field.eval(
-                cluster, ray.o, ray.d, pdf, specular, sampler.next_1d(), sampler.next_2d(), left
+                cluster, ray.o, ray.d, pdf, specular, spare.next_1d(), spare.next_2d(), left
             )
-            looked_up = left & trusted
+            radiance[left & trusted] += throughput * far_radiance
             retrace = left & ~trusted
-            radiance[looked_up] += throughput * far_radiance
-            beyond = mi.Ray3f(ray(ray.maxt), ray.d)
-            source_si, source_visible = far_field.intersect_sources(scene, beyond, looked_up)
-            source_si = dr.select(looked_up, source_si, si)
-            source_active &= ~retrace & (~looked_up | source_visible)
+            source_active &= ~left
+            if dr.hint(far_field.sources is not None, mode="scalar"):
+                searching = left & trusted & (reach == dr.inf)
+                beyond = mi.Ray3f(ray(ray.maxt), ray.d)
+                far_si, visible = far_field.intersect_sources(scene, beyond, searching)
+                source_si = dr.select(searching, far_si, si)
+                source_active |= visible
 
         # ---------------------- Sources hit ----------------------
 
@@ -205,29 +214,31 @@ def follow(
         normal, object_id = facing(si, ray), transport.object_ids(si)
         cell, size, found = patches.find_cell(si.p, normal, object_id, smooth)
         deep = found & (depth >= transport.gather_depth)
-        patch, has_patch = patches.find(si.p, normal, object_id, size, deep, sampler.next_2d())
+        patch, has_patch = patches.find(si.p, normal, object_id, size, deep, spare.next_2d())
         # A coarse mesh can't serve hits about as near as its patches are large (corners,
         # contacts). The threshold is random, so that no border shows.
-        near = (bounces > 0) & (dr.norm(si.p - origin.p) < size * (0.5 + sampler.next_1d()))
+        near = (bounces > 0) & (dr.norm(si.p - origin.p) < size * (0.5 + spare.next_1d()))
         served = has_patch & ~near
         # Total irradiance stands for direct light too.
         lit = served & (depth > 0)
         if dr.hint(transport.shadow_rays, mode="scalar"):
             lit = mi.Bool(False)
+        cube = None
+        if dr.hint(far_field is not None, mode="scalar"):
+            cube = far_field.cube(cell, si.p, found)
+        vertex = Vertex(si, bsdf, served, lit, cube)
         sampled = smooth & ~(lit & only_wide(bsdf))
         if dr.hint(transport.shadow_samples > 1, mode="scalar"):
             # Camera hits get several; further on one more sample of the pixel serves better.
             n = dr.select(depth == 0, mi.UInt32(transport.shadow_samples), mi.UInt32(1))
-            light = sample_sources(scene, si, bsdf, sampler, n, served, lit, sampled)
+            light = sample_sources(scene, vertex, sampler, n, True, sampled)
             bs, bsdf_weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), hit)
         else:
             ds, em_weight = scene.sample_emitter_direction(si, sampler.next_2d(), False, sampled)
             bsdf_value, bsdf_pdf, bs, bsdf_weight = bsdf.eval_pdf_sample(
                 ctx, si, si.to_local(ds.d), sampler.next_1d(), sampler.next_2d(), hit
             )
-            light = reflected_source(
-                scene, si, ds, em_weight, bsdf_value, bsdf_pdf, served, lit, sampled
-            )
+            light = vertex.reflected(scene, ds, em_weight, bsdf_value, bsdf_pdf, sampled)
         radiance += throughput * light
 
         # ---------------------- End in the cache ----------------------
@@ -236,13 +247,15 @@ def follow(
         eta *= bs.eta
         valid |= hit & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         sampled_specular = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        ends = served & ~sampled_specular & is_wide(si, bs.wo, bs.pdf)
+        wide = is_wide(si, bs.wo, bs.pdf) & ~sampled_specular
+        ends = served & wide
         weight[ends] = throughput
         row[ends] = 2 * patch + dr.select(lit, mi.UInt32(0), mi.UInt32(1))
 
         # ---------------------- Next ray ----------------------
 
-        # ``retrace`` lanes repeat this segment from where it left the cube.
+        # ``retrace`` lanes repeat this segment from where it left the cube; sources farther away
+        # than they may count have been counted.
         next_ray = si.spawn_ray(si.to_world(bs.wo))
         ray = dr.select(retrace, mi.Ray3f(ray(ray.maxt), ray.d), next_ray)
         ray.maxt = dr.largest(mi.Float)
@@ -250,11 +263,14 @@ def follow(
         specular = dr.select(retrace, specular, sampled_specular)
         origin = dr.select(retrace, origin, mi.Interaction3f(si))
         depth += dr.select(hit & ~sampled_specular, mi.UInt32(1), mi.UInt32(0))
+        counted = retrace & (reach < dr.inf)
+        reach = mi.Float(dr.inf)
         if dr.hint(far_field is not None, mode="scalar"):
-            cluster, bounded, maxt = far_field.bound(
-                cell, ray, pdf, sampled_specular, sampler.next_1d(), found & ~retrace
+            cluster = cube.cluster
+            bounded, ray.maxt, reach = far_field.bound(
+                cube, ray, pdf, wide, specular, spare.next_1d(), ~retrace
             )
-            ray.maxt = maxt
+        reach = dr.select(counted, -1, reach)
         active &= retrace | (hit & ~ends & (dr.max(throughput) != 0))
 
         # ---------------------- Russian roulette ----------------------
@@ -273,38 +289,67 @@ def facing(si, ray):
     return dr.mulsign(si.n, -dr.dot(si.n, ray.d))
 
 
+@dataclass
+class Vertex:
+    """A surface that reflects light from sources.
+
+    si, bsdf   the surface
+    served     whether the cache holds light for it
+    lit        whether the cache's light includes direct light
+    cube       the cube that bounds secondary rays from it, or None
+    """
+
+    si: mi.SurfaceInteraction3f
+    bsdf: mi.BSDFPtr
+    served: mi.Bool
+    lit: mi.Bool
+    cube: Cube | None
+
+    def reflected(self, scene, ds, em_weight, bsdf_value, bsdf_pdf, active):
+        """Light [W/m²/sr] reflected from a sampled direction to a source.
+
+        Wide lobes aren't traced on where the cache serves the surface, nor beyond its cube. From
+        there, shadow rays alone bring light, or the cache alone where it has lit the surface.
+        """
+        wide = is_wide(self.si, self.si.to_local(ds.d), bsdf_pdf)
+        cached = wide & self.served
+        alone = cached
+        if self.cube is not None:
+            alone |= wide & (self.cube.exit(self.si.p, ds.d) < ds.dist)
+        mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, dr.select(alone, 0, bsdf_pdf)))
+        light = bsdf_value * em_weight * mis
+        active = active & (ds.pdf != 0) & ~(cached & self.lit) & (dr.max(light) > 0)
+        active &= ~scene.ray_test(self.si.spawn_ray_to(ds.p), active)
+        return dr.select(active, light, 0)
+
+
 @dr.syntax
-def sample_sources(scene, si, bsdf, sampler, count, served, lit, active):
-    """Direct light [W/m²/sr] reflected at a surface, by ``count`` stratified shadow rays a lane."""
-    ctx = mi.BSDFContext()
+def sample_sources(scene, vertex, sampler, count, several, active):
+    """Direct light [W/m²/sr] reflected at a vertex, by ``count`` stratified shadow rays a lane.
+
+    ``several`` tells whether any lane's count exceeds one.
+    """
+    if dr.hint(not several, mode="scalar"):
+        return sample_source(scene, vertex, sampler.next_2d(), active)
     result = mi.Spectrum(0)
     i = mi.UInt32(0)
     active = mi.Bool(active)
-    while dr.hint(active, exclude=[bsdf], label="Shadow rays"):
+    while dr.hint(active, exclude=[vertex], label="Shadow rays"):
         u = sampler.next_2d()
         u.x = (u.x + mi.Float(i)) / mi.Float(count)
-        ds, em_weight = scene.sample_emitter_direction(si, u, False, active)
-        bsdf_value, bsdf_pdf = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), active)
-        result += reflected_source(
-            scene, si, ds, em_weight, bsdf_value, bsdf_pdf, served, lit, active
-        )
+        result += sample_source(scene, vertex, u, active)
         i += 1
         active &= i < count
     return result / mi.Float(count)
 
 
-def reflected_source(scene, si, ds, em_weight, bsdf_value, bsdf_pdf, served, lit, active):
-    """Light [W/m²/sr] that a surface reflects from a sampled direction to a source.
-
-    Where the cache serves the surface, wide lobes aren't traced on: their direct light comes from
-    shadow rays alone, or, where the cache has lit the surface already (``lit``), from the cache.
-    """
-    cached = served & is_wide(si, si.to_local(ds.d), bsdf_pdf)
-    mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, dr.select(cached, 0, bsdf_pdf)))
-    light = bsdf_value * em_weight * mis
-    active = active & (ds.pdf != 0) & ~(cached & lit) & (dr.max(light) > 0)
-    active &= ~scene.ray_test(si.spawn_ray_to(ds.p), active)
-    return dr.select(active, light, 0)
+def sample_source(scene, vertex, u, active):
+    """Direct light [W/m²/sr] reflected at a vertex, by one shadow ray."""
+    si = vertex.si
+    ds, em_weight = scene.sample_emitter_direction(si, u, False, active)
+    wo = si.to_local(ds.d)
+    bsdf_value, bsdf_pdf = vertex.bsdf.eval_pdf(mi.BSDFContext(), si, wo, active)
+    return vertex.reflected(scene, ds, em_weight, bsdf_value, bsdf_pdf, active)
 
 
 def only_wide(bsdf):

@@ -129,7 +129,7 @@ def materials() -> list[dict]:
 
 
 def show_case() -> mi.Scene:
-    """A ball of each material in a shining box, one to a tile of 8 x 8 pixels."""
+    """A ball of each material in a shining hollow one, one to a tile of 8 x 8 pixels."""
     balls = {
         name: ball(i % 4 - 1.5, 1.5 - i // 4, 0, 0.45) | {"bsdf": material}
         for i, (name, material) in enumerate(zip(MATERIALS, materials(), strict=True))
@@ -140,7 +140,7 @@ def show_case() -> mi.Scene:
         "film": film(32, 32),
     }
     del orthographic["fov"], orthographic["near_clip"]
-    walls = {"type": "cube", "to_world": scaled(3), "flip_normals": True}
+    walls = ball(0, 0, 0, 4) | {"flip_normals": True}
     return load(
         {"type": "scene", "sensor": orthographic, "walls": dressed(walls, 0.5, 0.5)} | balls
     )
@@ -165,4 +165,4 @@ def ours(request, scene):
 @pytest.mark.parametrize("material", MATERIALS)
 def test_energy_of_materials(ours, path, material):
     tile = divmod(MATERIALS.index(material), 4)
-    assert_agree(ours.at(tile), path.at(tile), allowed=0.01)
+    assert_agree(ours.at(tile), path.at(tile), allowed=0.01, precision=0.02)
