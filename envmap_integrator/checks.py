@@ -40,8 +40,9 @@ def check_scene(scene: mi.Scene, owner: str) -> None:
                 continue
             if _scatters(medium):
                 raise ValueError(
-                    f'{owner}: shape "{shape.id()}" has a participating medium ({medium.class_name()}'
-                    f' as "{name}"), which isn\'t supported; remove it or use volpath'
+                    f'{owner}: shape "{shape.id()}" has a participating medium '
+                    f'({medium.class_name()} as "{name}"), which isn\'t supported; remove it or '
+                    "use volpath"
                 )
             mi.Log(
                 mi.LogLevel.Warn,

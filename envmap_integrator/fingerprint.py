@@ -8,6 +8,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .scene_order import ordered_shapes
+
 
 class SceneFingerprint:
     """Content hash of the parameters of all shapes, materials and emitters of a scene.
@@ -41,8 +43,10 @@ class SceneFingerprint:
 
 def _parameters(scene: mi.Scene) -> tuple[tuple, str]:
     """Dr.Jit arrays and a text of everything else."""
+    # Area emitters come with their shapes.
+    environment = [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
     arrays, scalars = [], [f"{len(mi.Spectrum())} channels"]
-    for item in (*scene.shapes(), *scene.emitters()):
+    for item in (*ordered_shapes(scene), *environment):
         scalars.append(f"{item.class_name()}")
         if isinstance(item, mi.Shape):
             scalars.append(str(item.bbox()))

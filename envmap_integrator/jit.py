@@ -4,6 +4,21 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
+
+
+def upload(dtype: type, values: np.ndarray) -> mi.Float | mi.UInt32:
+    """A one-dimensional Dr.Jit array of NumPy values, in memory of Dr.Jit's own.
+
+    A plain conversion would map NumPy's memory. Where that isn't aligned, packed gathers fall
+    apart into scalar ones, and kernels differ from run to run.
+    """
+    values = np.ascontiguousarray(values).ravel()
+    result = dr.empty(dtype, len(values))
+    if len(values):
+        dr.scatter(result, dtype(values), dr.arange(mi.UInt32, len(values)))
+        dr.eval(result)
+    return result
 
 
 def opaque_point(values) -> mi.Point3f:

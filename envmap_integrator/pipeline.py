@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .jit import opaque_point
+from .jit import opaque_point, upload
 from .maps.clusters import (
     ClusterRequest,
     cluster_of_cell,
@@ -18,6 +18,7 @@ from .maps.clusters import (
     listed_clusters,
 )
 from .maps.cube_map import CubeMap, from_parts, to_parts
+from .radiosity.evenness import drop_uneven
 from .radiosity.irradiance import IrradianceCache, solve_irradiance
 from .radiosity.patches import Patches, build_patches
 from .radiosity.surface_points import ObjectIds, scatter_points
@@ -71,6 +72,7 @@ def prepare(scene: mi.Scene, key: str, settings: Settings, baker=None) -> Prepar
         object_ids = ObjectIds(scene)
         points = scatter_points(scene, object_ids, POINTS_PER_PATCH * settings.patches)
         patches, patch_of_point, cell_of_point = build_patches(points, object_ids, settings.patches)
+        patches, patch_of_point = drop_uneven(scene, patches, points, patch_of_point)
 
     with _timed(times, "irradiance cache"):
         cache = solve_irradiance(
@@ -150,7 +152,7 @@ def save(path, prepared: Prepared) -> None:
 
 
 def load(path, key: str, owner: str) -> Prepared:
-    """Read a prepared state that belongs to ``key``; ``ValueError`` if there is none in the file."""
+    """Read a prepared state; ``ValueError`` if the file holds none that belongs to ``key``."""
     path = mi.file_resolver().resolve(path)
     try:
         parts, metadata = read(path, "make it with envmap-render bake")
@@ -174,17 +176,15 @@ def load(path, key: str, owner: str) -> Prepared:
     patches = Patches(
         origin=opaque_point(metadata["origin"]),
         size=dr.opaque(mi.Float, metadata["size"]),
-        levels=mi.UInt32(values("levels", "entry", metadata["levels"])),
-        cells=mi.UInt32(values("patches", "fingerprint", n_patches)),
+        levels=upload(mi.UInt32, values("levels", "entry", metadata["levels"])),
+        cells=upload(mi.UInt32, values("patches", "fingerprint", n_patches)),
         use_objects=metadata["use_objects"],
     )
-    table = mi.Float(values("irradiance", "Y", 2 * n_patches * metadata["channels"]))
+    table = upload(mi.Float, values("irradiance", "Y", 2 * n_patches * metadata["channels"]))
     membership = None
     if "cluster_of_cell" in parts:
         membership = values("cluster_of_cell", "cluster", metadata["levels"])
-    return Prepared(
-        key, IrradianceCache(patches, table), maps, membership, metadata["stage_times"]
-    )
+    return Prepared(key, IrradianceCache(patches, table), maps, membership, metadata["stage_times"])
 
 
 def _image(values: np.ndarray) -> np.ndarray:

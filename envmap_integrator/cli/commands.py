@@ -55,7 +55,7 @@ def bake(args: argparse.Namespace) -> int:
     _configure_machine(args)
     seconds: dict[str, float] = {}
     with record_kernels():
-        scene_file, scene = _load(args, seconds)
+        scene_file, scene = _load(args, seconds, merge_meshes=False)
         name = scene_file.integrator.plugin_name()
         _require(
             hasattr(scene.integrator(), "prepare"),
@@ -86,11 +86,13 @@ def _configure_machine(args: argparse.Namespace) -> None:
         dr.set_thread_count(args.threads)
 
 
-def _load(args: argparse.Namespace, seconds: dict[str, float]) -> tuple[SceneFile, mi.Scene]:
+def _load(
+    args: argparse.Namespace, seconds: dict[str, float], merge_meshes: bool = True
+) -> tuple[SceneFile, mi.Scene]:
     with measure(seconds, "load"):
         scene_file = SceneFile(args.scene, dict(args.define))
         scene_file.configure_integrator(args.integrator, dict(args.set))
-        return scene_file, scene_file.load()
+        return scene_file, scene_file.load(merge_meshes)
 
 
 def _sensor(scene: mi.Scene, index: int) -> mi.Sensor:

@@ -6,6 +6,9 @@ import re
 
 _CPP_LOCATION = re.compile(r"\[\w+\.(?:cpp|h):\d+\] ")
 
+#: What Python puts before the message of an exception that has come through C++.
+_PYTHON_TRACEBACK = re.compile(r"^.*?Traceback \(most recent call last\):.*\n\w*Error: ", re.DOTALL)
+
 _MENDS = (
     (re.compile(r"Plugin \"[^\"]*\" not found"), "check its spelling, or pass --integrator NAME"),
     (re.compile(r"unreferenced propert"), "check the spelling, or remove it"),
@@ -20,6 +23,7 @@ _MENDS = (
 def condense(error: BaseException) -> str:
     """The message on one line, without C++ locations, followed by what to do about it if known."""
     text = _CPP_LOCATION.sub("", str(error)) or type(error).__name__
+    text = _PYTHON_TRACEBACK.sub("", text)
     text = " ".join(text.split())
     for pattern, mend in _MENDS:
         if match := pattern.search(text):

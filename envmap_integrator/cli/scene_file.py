@@ -60,12 +60,24 @@ class SceneFile:
             if not filters:
                 self._append_child(film, mi.ObjectType.ReconstructionFilter, "box")
 
-    def load(self) -> mi.Scene:
-        """Instantiate the scene."""
+    def load(self, merge_meshes: bool = True) -> mi.Scene:
+        """Instantiate the scene.
+
+        Meshes that share a material are merged, as by ``mi.load_file``, unless the integrator
+        relies on what merging changes: the ids of shapes, and their order, which is then another
+        one each time and would make a stored state useless.
+        """
+        stored = "cache_file" in self.integrator
+        self._config.merge_meshes = merge_meshes and not stored and not self._lists_shapes()
         state = mi.parser.ParserState(self._state)
         with _search_folder(self._folder):
             mi.parser.transform_all(self._config, state)
             return mi.parser.instantiate(self._config, state)
+
+    def _lists_shapes(self) -> bool:
+        """Does the integrator hold clusters that the user has listed?"""
+        emitters = self._children(self._integrator_node, mi.ObjectType.Emitter)
+        return any("shapes" in emitter.props for emitter in emitters)
 
     @property
     def _integrator_node(self) -> mi.parser.SceneNode:
@@ -74,9 +86,10 @@ class SceneFile:
     def _children(
         self, parent: mi.parser.SceneNode, kind: mi.ObjectType
     ) -> list[mi.parser.SceneNode]:
+        # A copy: Mitsuba takes what has been read for known, and would miss misspelt names.
         references = [
             value
-            for _, value in parent.props.items()
+            for _, value in mi.Properties(parent.props).items()
             if isinstance(value, mi.Properties.ResolvedReference)
         ]
         nodes = [self._state.nodes[reference.index()] for reference in references]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from ..checks import check_variant
+from ..jit import upload
 from ..maps.clusters import ClusterRequest
 from ..maps.cube import direction_to_face, face_to_direction, solid_angles, texel
 from ..maps.cube_map import from_parts
@@ -47,6 +47,11 @@ class MipmapCube(mi.Emitter):
         check_variant(props.plugin_name())
         super().__init__(props)
         parameters = Parameters(props)
+        if "to_world" in props:
+            raise ValueError(
+                f'{parameters.owner}: "to_world" isn\'t supported, maps lie in world space; '
+                "remove it"
+            )
         shapes = parameters.text("shapes")
         filename = parameters.text("filename")
         if bool(shapes) == bool(filename):
@@ -124,7 +129,7 @@ class MipmapCube(mi.Emitter):
                 f"mipmap_cube: the map has {n_channels} colour channels, variant {mi.variant()} "
                 f"needs {len(mi.Spectrum())}; bake it with this variant"
             )
-        self._texels = mi.Float(np.ascontiguousarray(texels[:, :n_channels]).ravel())
+        self._texels = upload(mi.Float, texels[:, :n_channels])
         level = int(round(self.level))
         level = min(max(level, 0), len(self.cube_map.levels) - 1)
         radiance = self.cube_map.levels[level][..., :n_channels].mean(axis=-1)

@@ -1,4 +1,4 @@
-"""What the integrators share: parameters of the radiosity pass, preparation, the sampling kernel."""
+"""What the integrators share: preparation and the sampling kernel."""
 
 from __future__ import annotations
 
@@ -81,15 +81,21 @@ class CachedIntegrator(mi.SamplingIntegrator):
 
     def object_ids(self, scene: mi.Scene) -> ObjectIds:
         """The ids of the scene at hand: other scenes of the same content have others."""
-        if self._object_ids is None or self._object_ids[0] is not scene:
-            self._object_ids = scene, ObjectIds(scene)
+        # Holding on to the scene, which holds this integrator, would keep both alive for ever.
+        key = dr.reinterpret_array(mi.UInt32, scene.shapes_dr()).numpy().tobytes()
+        if self._object_ids is None or self._object_ids[0] != key:
+            self._object_ids = key, ObjectIds(scene)
         return self._object_ids[1]
 
     # ---------------------- Rendering ----------------------
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
-        self.prepare(scene)
+        if isinstance(sensor, int):
+            sensor = scene.sensors()[sensor]
+        prepared = self.prepare(scene)
         with dr.suspend_grad():
+            # What kernels read is put in place before the first one is recorded.
+            self.transport(scene, prepared, spp or sensor.sampler().sample_count())
             return super().render(scene, sensor, seed, spp, develop, evaluate)
 
     def sample(self, scene, sampler, ray, medium=None, active=True):

@@ -31,13 +31,22 @@ class EnvmapBake(CachedIntegrator):
        - Rays per texel, a power of two. (Default: 8)
      * - patches
        - |int|
-       - Budget of patches of the coarse mesh; unused when nested. (Default: 16384)
+       - Budget of patches of the coarse mesh, 16 … 4194304; unused when nested. (Default:
+         16384)
      * - patch_samples
        - |int|
        - Gather rays and shadow rays per patch, a power of two; unused when nested. (Default: 128)
      * - shadow_samples
        - |int|
        - Shadow rays where a bake ray hits. (Default: 1)
+     * - cache_file
+       - |string|
+       - File with the baked state, from :monosp:`envmap-render bake`; unused when nested. (Default:
+         none, bake now)
+     * - hide_emitters
+       - |bool|
+       - No effect here: sources that the sensor's rays hit are left out in any case. (Default:
+         false)
     """
 
     def __init__(self, props: mi.Properties):
@@ -57,9 +66,7 @@ class EnvmapBake(CachedIntegrator):
         return ["distance"]
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
-        radiance, distance, valid = self.radiance(
-            scene, self.prepare(scene), sampler, ray, active
-        )
+        radiance, distance, valid = self.radiance(scene, self.prepare(scene), sampler, ray, active)
         return radiance, valid, [dr.select(valid, distance, 0)]
 
     def bake(self, scene, prepared, cluster, points, resolution, seed) -> CubeMap:

@@ -16,9 +16,9 @@ class EnvmapHybrid(CachedIntegrator):
     r"""
     Environment mapping for diffuse interreflection (:monosp:`envmap_hybrid`)
 
-    Secondary rays are traced only inside a cube around the cluster of objects they start from; those
-    that leave it read a prefiltered map of what lies beyond, at the mip level that the density
-    of the samples asks for. What they hit inside is shaded from the irradiance cache. Light
+    Secondary rays are traced only inside a cube around the cluster of objects they start from;
+    those that leave it read a prefiltered map of what lies beyond, at the mip level that the
+    density of the samples asks for. What they hit inside is shaded from the irradiance cache. Light
     sources are reached by shadow rays (Reinhard, Tijssen and Jansen 1994).
 
     Without any parameter, clusters are found automatically. Nested emitters
@@ -53,8 +53,8 @@ class EnvmapHybrid(CachedIntegrator):
          direction, as the paper does. (Default: corrected)
      * - mirrors
        - |string|
-       - ``trace`` follows perfect mirrors, and lobes finer than the map's texels, in full; ``map``
-         looks them up like all else. (Default: trace)
+       - ``trace`` follows mirrors and narrow lobes in full; ``map`` looks them up like all
+         else. (Default: trace)
      * - map_resolution
        - |int|
        - Texels along the edge of a map's face, a power of two up to 2048. (Default: 64)
@@ -106,15 +106,15 @@ class EnvmapHybrid(CachedIntegrator):
 
         self.baker = None
         requests = []
-        for name, child in props.objects():
+        for _, child in props.objects():
             if isinstance(child, EnvmapBake) and self.baker is None:
                 self.baker = child
             elif isinstance(child, MipmapCube) and child.request is not None:
                 requests.append(child.request)
             else:
                 raise TypeError(
-                    f'{self.owner}: "{name}" must be one envmap_bake or a mipmap_cube with '
-                    f'"shapes", not {child.class_name()}'
+                    f'{self.owner}: the nested {child.class_name()} "{child.id()}" must be one '
+                    'envmap_bake or a mipmap_cube with "shapes"'
                 )
         self.requests = tuple(requests)
         self.baker = self.baker or mi.load_dict({"type": "envmap_bake"})
@@ -148,13 +148,16 @@ class EnvmapHybrid(CachedIntegrator):
         key = (id(scene), id(prepared), spp)
         if self._far_field is None or self._far_field[0] != key:
             n_samples = spp * self.secondary_samples
-            self._far_field = key, far_field(
-                scene,
-                prepared.maps,
-                prepared.cluster_of_cell,
-                n_samples,
-                self.mip_bias,
-                corrected=self.lookup == "corrected",
-                map_mirrors=self.mirrors == "map",
+            self._far_field = (
+                key,
+                far_field(
+                    scene,
+                    prepared.maps,
+                    prepared.cluster_of_cell,
+                    n_samples,
+                    self.mip_bias,
+                    corrected=self.lookup == "corrected",
+                    map_mirrors=self.mirrors == "map",
+                ),
             )
         return self._far_field[1]

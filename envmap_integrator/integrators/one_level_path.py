@@ -20,7 +20,7 @@ class OneLevelPath(CachedIntegrator):
 
      * - patches
        - |int|
-       - Budget of patches of the coarse mesh. (Default: 16384)
+       - Budget of patches of the coarse mesh, 16 … 4194304. (Default: 16384)
      * - patch_samples
        - |int|
        - Gather rays and shadow rays per patch, a power of two. (Default: 128)
@@ -30,6 +30,9 @@ class OneLevelPath(CachedIntegrator):
      * - secondary_samples
        - |int|
        - Secondary rays at a camera hit. (Default: 1)
+     * - cache_file
+       - |string|
+       - File with the baked state, from :monosp:`envmap-render bake`. (Default: none, bake now)
      * - hide_emitters
        - |bool|
        - Hide directly visible emitters. (Default: false)

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..jit import opaque_point
+from ..jit import opaque_point, upload
 from ..progress import stage
 from ..radiosity.surface_points import SurfacePoints
 from .clusters import Cluster
@@ -40,8 +40,8 @@ def bake_map(
     half_width = dr.opaque(mi.Float, cluster.half_width)
     centre = opaque_point(cluster.centre)
     resolution_ = dr.opaque(mi.UInt32, resolution)
-    position = mi.Float(points.position.astype(np.float32).ravel())
-    normals = mi.Float(points.normal.astype(np.float32).ravel())
+    position = upload(mi.Float, points.position)
+    normals = upload(mi.Float, points.normal)
     n_points = dr.opaque(mi.UInt32, len(points))
 
     launch = max(MAX_LANES // samples, 1)

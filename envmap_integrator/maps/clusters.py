@@ -1,7 +1,7 @@
 """Clusters: groups of surfaces that share one cube map (paper section 2, "map generation").
 
-A cluster is a set of cells of the coarse mesh, not of shapes: Mitsuba merges meshes that share a material, so one
-shape may be all the woodwork of a house.
+A cluster is a set of cells of the coarse mesh, not of shapes: Mitsuba merges meshes that share a
+material, so one shape may be all the woodwork of a house.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 
 from ..radiosity.surface_points import SurfacePoints
+from ..scene_order import ordered_shapes
 
 #: Flat pieces longer than this fraction of the scene are surroundings (floors, walls).
 LARGEST_PLANE = 0.4
@@ -62,7 +63,7 @@ def listed_clusters(
 
     Raises ``ValueError`` if a shape isn't in the scene, is listed twice or has no surface.
     """
-    ids = [shape.id() for shape in scene.shapes()]
+    ids = [shape.id() for shape in ordered_shapes(scene)]
     clusters = []
     cluster_of_object = np.full(len(ids), -1)
     for index, request in enumerate(requests):
@@ -87,9 +88,7 @@ def listed_clusters(
     return clusters, cluster_of_object[points.object_id]
 
 
-def find_clusters(
-    points: SurfacePoints, distance_ratio: float
-) -> tuple[list[Cluster], np.ndarray]:
+def find_clusters(points: SurfacePoints, distance_ratio: float) -> tuple[list[Cluster], np.ndarray]:
     """Group the contents of the scene, as far as its sensors see them, into clusters.
 
     Returns the clusters and the cluster of every surface point [N], -1 if it belongs to none.

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..jit import upload
 from .cube import direction_to_face, exit_distance, face_to_direction, texel
 from .cube_map import CubeMap
 
@@ -15,8 +16,6 @@ from .cube_map import CubeMap
 CORRECTION_STEPS = 3
 #: A far hit is trusted if the map's distance there agrees with it to this fraction.
 DISTANCE_TOLERANCE = 0.1
-#: Lobes that cover fewer finest-level texels than this are traced in full, not looked up.
-MIN_LOBE_TEXELS = 32.0
 #: Rays are traced up to this fraction beyond the cube, at random, so that its border turns into
 #: noise. Never less: the map doesn't hold what is inside.
 HAND_OFF = 0.1
@@ -24,7 +23,7 @@ HAND_OFF = 0.1
 
 @dataclass(frozen=True)
 class Cube:
-    """A lane's cube: index of its cluster, centre, half width [world units], whether there is one."""
+    """A lane's cube: its cluster, centre, half width [world units], and whether there is one."""
 
     cluster: mi.UInt32
     centre: mi.Point3f
@@ -47,9 +46,9 @@ class FarField:
     resolution         [1]       face resolution R of the finest level
     n_samples          [1]       samples that share a pixel: spp times secondary samples
     mip_bias           [1]       levels added to the look-up
-    map_mirrors        whether mirrors and lobes finer than texels read the map (else traced)
+    map_mirrors        whether mirrors and narrow lobes read the map too (else traced)
     corrected          whether look-ups use the distance (else the bare direction, as the paper)
-    sources            scene of the emitters' shapes alone, None if no ray needs to look for them
+    sources            scene of the emitters' shapes alone, for the mirrors that read the map
     has_environment    whether the scene has an environment emitter
     """
 
@@ -77,16 +76,16 @@ class FarField:
         active &= dr.all(dr.abs(p - centre) < half_width)
         return Cube(cluster, centre, half_width, active)
 
-    def bound(self, cube, ray, pdf, wide, specular, u, active):
+    def bound(self, cube, ray, wide, u, active):
         """Bound secondary rays by their cube: ``(bounded, maxt, reach)``.
 
-        Lobes too narrow for the map's texels aren't bounded. Rays are traced a little farther than
-        the cube, but wide lobes count only the sources that they hit inside (``reach``).
+        Only wide lobes are bounded, unless mirrors are to read the map too: tracing the few narrow
+        ones in full costs less than looking for the sources that they see beyond the cube. Rays
+        are traced a little farther than the cube, but wide lobes count only the sources that they
+        hit inside (``reach``): shadow rays alone count those beyond.
         """
-        texel_solid_angle = 4 / dr.square(mi.Float(self.resolution))
-        resolved = ~specular & (pdf * texel_solid_angle * MIN_LOBE_TEXELS < 1)
         t = cube.exit(ray.o, ray.d)
-        bounded = active & (wide | resolved | self.map_mirrors) & (t > 0) & (t < dr.inf)
+        bounded = active & (wide | self.map_mirrors) & (t > 0) & (t < dr.inf)
         maxt = dr.select(bounded, t * (1 + HAND_OFF * u), dr.largest(mi.Float))
         return bounded, maxt, dr.select(bounded & wide, t, dr.inf)
 
@@ -173,30 +172,25 @@ def far_field(
         return None
     cubes = [[*cube_map.cluster.centre, cube_map.cluster.half_width] for cube_map in maps]
     return FarField(
-        cubes=mi.Float(np.array(cubes, dtype=np.float32).ravel()),
-        texels=mi.Float(np.concatenate([cube_map.texels() for cube_map in maps]).ravel()),
-        cluster_of_cell=mi.UInt32(cluster_of_cell),
+        cubes=upload(mi.Float, np.array(cubes, dtype=np.float32)),
+        texels=upload(mi.Float, np.concatenate([cube_map.texels() for cube_map in maps])),
+        cluster_of_cell=upload(mi.UInt32, cluster_of_cell),
         n_clusters=dr.opaque(mi.UInt32, len(maps)),
         resolution=dr.opaque(mi.UInt32, maps[0].resolution),
         n_samples=dr.opaque(mi.Float, n_samples),
         mip_bias=dr.opaque(mi.Float, mip_bias),
         corrected=corrected,
         map_mirrors=map_mirrors,
-        sources=_source_scene(scene, map_mirrors),
+        sources=_source_scene(scene) if map_mirrors else None,
         has_environment=scene.environment() is not None,
     )
 
 
-def _source_scene(scene: mi.Scene, map_mirrors: bool) -> mi.Scene | None:
-    """A scene of the emitters' shapes alone; None if only wide lobes read the maps.
-
-    Under those, shadow rays alone account for the sources beyond a cube.
-    """
-    if not map_mirrors and not any(map(_may_be_narrow, scene.shapes())):
-        return None
+def _source_scene(scene: mi.Scene) -> mi.Scene:
+    """A scene of the emitters' shapes alone."""
     shapes = [shape for shape in scene.shapes() if shape.is_emitter()]
-    # An empty scene can't be traced; a point far outside every cube stands for it.
-    nowhere = {"type": "sphere", "radius": 1e-30, "center": [1e30, 1e30, 1e30]}
+    # An empty scene can't be traced; a shape out of reach stands for it.
+    nowhere = {"type": "sphere", "center": [1e12, 1e12, 1e12]}
     ids = [shape.id() for shape in shapes]
     sources = mi.load_dict(
         {"type": "scene", "nowhere": nowhere} | {f"shape{i}": s for i, s in enumerate(shapes)}
@@ -204,16 +198,6 @@ def _source_scene(scene: mi.Scene, map_mirrors: bool) -> mi.Scene | None:
     for shape, id_ in zip(shapes, ids, strict=True):  # Loading has renamed them.
         shape.set_id(id_)
     return sources
-
-
-def _may_be_narrow(shape: mi.Shape) -> bool:
-    """Whether a shape may have lobes that are narrower than a diffuse one, but not perfect mirrors.
-
-    The materials within an instance can't be asked.
-    """
-    bsdf = shape.bsdf()
-    narrow = mi.BSDFFlags.Glossy | mi.BSDFFlags.DiffuseTransmission
-    return bsdf is None or bool(bsdf.flags() & int(narrow))
 
 
 def texel_type():

@@ -14,7 +14,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..jit import upload
 from ..progress import stage
+from .patch_points import PatchPoints
 from .patches import Patches
 from .surface_points import SurfacePoints
 
@@ -60,50 +62,27 @@ def solve_irradiance(
     b the light that gather rays find outside the patches, and w the throughput with which they
     end in patch j, the solution fulfils E_i = mean(π b + w E(j)), where E(j) is E_d + E_i or E_i.
     """
-    order = np.flatnonzero(_worth_gathering(points, patch_of_point, transport.patches.count))
-    order = order[np.argsort(patch_of_point[order], kind="stable")]
-    patches, first = np.unique(patch_of_point[order], return_index=True)
-    first = np.append(first, len(order))
-    points = points.take(order)
-
-    if len(patches) == 0:  # Nothing but mirrors and glass.
+    members = PatchPoints(points, patch_of_point, transport.patches.count)
+    n_patches, launch = len(members.patches), max(MAX_LANES // samples, 1)
+    parts = []
+    with stage("Gathering irradiance", total=n_patches) as advance:
+        for begin in range(0, n_patches, launch):
+            end = min(begin + launch, n_patches)
+            parts.append(_gather(scene, transport, members, begin, end, samples, seed + 1 + begin))
+            advance(end - begin)
+    if not parts:  # Nothing but mirrors and glass.
         n_channels = len(mi.Spectrum())
         table = dr.zeros(mi.Float, 2 * transport.patches.count * n_channels)
         return IrradianceCache(transport.patches, table)
 
-    launch = max(MAX_LANES // samples, 1)
-    parts = []
-    with stage("Gathering irradiance", total=len(patches)) as advance:
-        for begin in range(0, len(patches), launch):
-            end = min(begin + launch, len(patches))
-            parts.append(
-                _gather(scene, transport, points, first, begin, end, samples, seed + 1 + begin)
-            )
-            advance(end - begin)
-    direct, escaped, weight, row = (
-        parts[0][i] if len(parts) == 1 else dr.concat([part[i] for part in parts], axis=-1)
-        for i in range(4)
-    )
-    table = _solve(
-        transport.patches.count, mi.UInt32(patches), direct, escaped, weight, row, samples
-    )
+    direct, escaped, weight, row = (_concatenate(part) for part in zip(*parts, strict=True))
+    patch = upload(mi.UInt32, members.patches.astype(np.uint32))
+    table = _solve(transport.patches.count, patch, direct, escaped, weight, row, samples)
     return IrradianceCache(transport.patches, table)
 
 
-def _worth_gathering(points, patch_of_point, n_patches):
-    """Which surface points [N] stand for their patch: if walks have come to it, only theirs.
-
-    Global lines also hit what no light reaches, such as the floor under a cupboard; it would
-    darken the part of the patch that looks out.
-    """
-    has_patch = patch_of_point >= 0
-    visited = np.zeros(n_patches, dtype=bool)
-    visited[patch_of_point[has_patch & (points.seen > 0)]] = True
-    return has_patch & ((points.seen > 0) | ~visited[patch_of_point])
-
-
-def _gather(scene, transport, points, first, begin, end, samples, seed):
-    """Trace the gather rays of patches ``begin`` … ``end``.
+def _gather(scene, transport, members, begin, end, samples, seed):
+    """Trace the gather rays of the ``begin``-th … ``end``-th patch.
 
     Returns direct irradiance and π b per patch, throughput and row per ray.
     """
@@ -113,27 +92,13 @@ def _gather(scene, transport, points, first, begin, end, samples, seed):
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, n_lanes)
     lane = dr.arange(mi.UInt32, n_lanes)
-    log_samples = dr.opaque(mi.UInt32, int(np.log2(samples)))
-    patch = lane >> log_samples
+    rank = lane >> dr.opaque(mi.UInt32, int(np.log2(samples)))
     k = lane & (dr.opaque(mi.UInt32, samples) - 1)
-
-    # ---- A point of the patch ----
-    first_point = dr.gather(mi.UInt32, mi.UInt32(first[begin:]), patch)
-    n_points = dr.gather(mi.UInt32, mi.UInt32(first[begin:]), patch + 1) - first_point
-    index = first_point + dr.minimum(
-        mi.UInt32(sampler.next_1d() * mi.Float(n_points)), n_points - 1
-    )
-    normal = dr.gather(mi.Normal3f, mi.Float(points.normal.ravel()), index)
-    shading_normal = dr.gather(mi.Normal3f, mi.Float(points.shading_normal.ravel()), index)
-    si = dr.zeros(mi.SurfaceInteraction3f, n_lanes)
-    si.p = dr.gather(mi.Point3f, mi.Float(points.position.ravel()), index)
-    si.n = normal
-    si.sh_frame = mi.Frame3f(shading_normal)
-    si.t = 0
+    si = members.sample(dr.opaque(mi.UInt32, begin) + rank, sampler.next_1d())
 
     # ---- Direction: cosine, stratified over the rays of a patch ----
     rotation = [
-        mi.sample_tea_float32(patch, dr.opaque(mi.UInt32, 2 * seed + i), 4) for i in range(2)
+        mi.sample_tea_float32(rank, dr.opaque(mi.UInt32, 2 * seed + i), 4) for i in range(2)
     ]
     u = mi.Point2f(
         mi.Float(k) / dr.opaque(mi.Float, samples) + rotation[0],
@@ -144,11 +109,9 @@ def _gather(scene, transport, points, first, begin, end, samples, seed):
     direction = si.to_world(wo)
 
     # ---- Direct light, by shadow rays and by the gather rays that hit a source ----
-    ds, em_weight = scene.sample_emitter_direction(si, sampler.next_2d(), True)
-    cosine = dr.maximum(dr.dot(shading_normal, ds.d), 0)
-    cosine = dr.select(dr.dot(normal, ds.d) > 0, cosine, 0)
-    mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, cosine * dr.inv_pi))
-    direct = em_weight * cosine * mis
+    ds, light = sample_irradiance(scene, si, sampler.next_2d())
+    cosine = dr.maximum(dr.dot(si.sh_frame.n, ds.d), 0)
+    direct = light * dr.select(ds.delta, 1, mis_weight(ds.pdf, cosine * dr.inv_pi))
 
     start = PathState(
         ray=si.spawn_ray(direction),
@@ -160,7 +123,7 @@ def _gather(scene, transport, points, first, begin, end, samples, seed):
         cluster=mi.UInt32(0),
         reach=mi.Float(dr.inf),
     )
-    above = (dr.dot(normal, direction) > 0) & (wo.z > 0)
+    above = (dr.dot(si.n, direction) > 0) & (wo.z > 0)
     end_ = follow(scene, transport, sampler, start, above)
     direct += dr.pi * end_.direct
     escaped = dr.pi * (end_.radiance - end_.direct)
@@ -172,6 +135,20 @@ def _gather(scene, transport, points, first, begin, end, samples, seed):
     weight = type(end_.weight)(*(finite(c) for c in end_.weight))
     dr.eval(direct, escaped, weight, end_.row)
     return direct, escaped, weight, end_.row
+
+
+def sample_irradiance(scene, si, u):
+    """One sample of the irradiance [W/m²] from sources at a point: ``(ds, irradiance)``."""
+    ds, em_weight = scene.sample_emitter_direction(si, u, True)
+    cosine = dr.maximum(dr.dot(si.sh_frame.n, ds.d), 0)
+    return ds, em_weight * dr.select(dr.dot(si.n, ds.d) > 0, cosine, 0)
+
+
+def _concatenate(parts):
+    """One array of scalars or spectra in place of several."""
+    if dr.depth_v(parts[0]) == 1:
+        return dr.concat(parts)
+    return type(parts[0])(*(dr.concat(components) for components in zip(*parts, strict=True)))
 
 
 def finite(x):

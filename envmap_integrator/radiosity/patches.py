@@ -15,12 +15,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..jit import mix, opaque_point
+from ..jit import mix, opaque_point, upload
 from .surface_points import ObjectIds, SurfacePoints
 
-#: Edge of the large cells as a fraction of the diagonal of the box that holds most surface points,
-#: and how often they may be halved. Patches are at most half as large.
-LARGE_CELL = 1 / 16
+#: Edge of the large cells as a fraction of the diagonal of the box that holds most surface points
+#: (more if the budget is small), and how often they may be halved.
+LARGE_CELL = 1 / 32
 MAX_LEVEL = 7
 #: Entries of a bucket of the hash tables, read by one packed gather.
 BUCKET = 4
@@ -63,7 +63,7 @@ class Patches:
         entry, found, cell = self._probe(
             self.levels, p, identity, mi.UInt32(0), _LEVEL_BITS, active
         )
-        level = (entry & ((1 << _LEVEL_BITS) - 1)) + 1
+        level = entry & ((1 << _LEVEL_BITS) - 1)
         return cell, self.size / mi.Float(mi.UInt32(1) << level), found
 
     def find(self, p, normal, object_id, size, active=True, u=None):
@@ -150,38 +150,52 @@ def build_patches(
     Returns the patches and, of every point, the patch index and the large cell's [N], -1 where
     it has none.
     """
+    if len(points) == 0:  # Nothing but mirrors and glass.
+        empty = np.zeros(0, dtype=np.int64)
+        return _no_patches(), empty, empty
     low, extent = points.bounds()
-    size = extent * LARGE_CELL
-    # An irrational offset keeps walls, mostly at round coordinates, off the cell borders.
-    origin = low - size * np.array([0.3819, 0.4142, 0.2361])
-    patches = Patches(
-        origin=opaque_point(origin),
-        size=dr.opaque(mi.Float, size),
-        levels=mi.UInt32(0),
-        cells=mi.UInt32(0),
-        use_objects=object_ids.count * 8 <= budget,
-    )
-    identity = patches._identity(
-        mi.Normal3f(points.normal.T), mi.UInt32(points.object_id.astype(np.uint32))
-    )
     position = mi.Point3f(points.position.T)
+    normal = mi.Normal3f(points.normal.T)
+    object_id = mi.UInt32(points.object_id.astype(np.uint32))
+    size = extent * LARGE_CELL
+    while True:
+        # An irrational offset keeps walls, mostly at round coordinates, off the cell borders.
+        patches = Patches(
+            origin=opaque_point(low - size * np.array([0.3819, 0.4142, 0.2361])),
+            size=dr.opaque(mi.Float, size),
+            levels=mi.UInt32(0),
+            cells=mi.UInt32(0),
+            use_objects=object_ids.count * 8 <= budget,
+        )
+        identity = patches._identity(normal, object_id)
+        key = _keys(patches, position, identity, mi.UInt32(0))
+        large, cell_of_point, n_points = np.unique(key, return_inverse=True, return_counts=True)
+        # Six directions of a hundred small objects may share the smallest grid there is.
+        if len(large) <= max(budget // 2, 8) or size > 4 * extent:
+            break
+        size *= 2
 
     # ---- Large cells choose their level by their number of points ----
-    key = _keys(patches, position, identity, mi.UInt32(0))
-    large, cell_of_point, n_points = np.unique(key, return_inverse=True, return_counts=True)
-    level = np.floor(0.5 * np.log2(np.maximum(n_points * (budget / max(len(points), 1)), 1)))
-    level = np.clip(level - 1, 0, MAX_LEVEL).astype(np.uint64)
+    level = np.round(0.5 * np.log2(np.maximum(n_points * (budget / len(points)), 1)))
+    level = np.clip(level, 0, MAX_LEVEL).astype(np.uint64)
     payload = np.uint64((1 << _LEVEL_BITS) - 1)
     levels, index_of_large = _hash_table((large & ~payload) | level)
     large_of_point = index_of_large[cell_of_point]
 
     # ---- Their cells are the patches ----
-    level_of_point = mi.UInt32(level[cell_of_point].astype(np.uint32) + 1)
+    level_of_point = mi.UInt32(level[cell_of_point].astype(np.uint32))
     key = _keys(patches, position, identity, level_of_point)
     cells, cell_of_point = np.unique(key, return_inverse=True)
     cells, patch_of_cell = _hash_table(cells)
-    patches = replace(patches, levels=mi.UInt32(levels), cells=mi.UInt32(cells))
+    patches = replace(patches, levels=upload(mi.UInt32, levels), cells=upload(mi.UInt32, cells))
     return patches, patch_of_cell[cell_of_point], large_of_point
+
+
+def _no_patches() -> Patches:
+    """A coarse mesh on which nothing is found."""
+    bucket = dr.zeros(mi.UInt32, BUCKET)
+    origin, size = opaque_point((0, 0, 0)), dr.opaque(mi.Float, 1)
+    return Patches(origin, size, levels=bucket, cells=mi.UInt32(bucket), use_objects=False)
 
 
 def _keys(patches: Patches, position, identity, level) -> np.ndarray:

@@ -12,6 +12,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..jit import upload
+from ..scene_order import ordered_shapes
+
 #: Hits followed along each global line, and along each walk from a sensor.
 LINE_HITS, WALK_HITS = 8, 4
 #: Batches of rays cast at most to find as many points as asked for.
@@ -60,18 +63,19 @@ class SurfacePoints:
 
 
 class ObjectIds:
-    """Dense index of the top-level shape under an interaction, in the order of the scene file.
+    """Dense index of the top-level shape under an interaction, as ``ordered_shapes`` counts them.
 
     Dr.Jit's own registry ids are global to the process and change from run to run; these don't,
     so what is stored by object id can be saved.
     """
 
     def __init__(self, scene: mi.Scene):
-        registry_ids = dr.reinterpret_array(mi.UInt32, scene.shapes_dr()).numpy()
+        shapes = mi.ShapePtr(ordered_shapes(scene))
+        registry_ids = dr.reinterpret_array(mi.UInt32, shapes).numpy()
         table = np.zeros(int(registry_ids.max(initial=0)) + 1, dtype=np.uint32)
         table[registry_ids] = np.arange(len(registry_ids), dtype=np.uint32)
         self.count = len(registry_ids)
-        self._table = mi.UInt32(table)
+        self._table = upload(mi.UInt32, table)
 
     def __call__(self, si: mi.SurfaceInteraction3f) -> mi.UInt32:
         shape = dr.reinterpret_array(mi.UInt32, si.shape)

@@ -118,7 +118,7 @@ def secondary(scene, transport, cache, sampler, vertex, u, active):
         wide = is_wide(si, bs.wo, bs.pdf) & ~specular
         start.cluster = vertex.cube.cluster
         start.bounded, start.ray.maxt, start.reach = transport.far_field.bound(
-            vertex.cube, start.ray, bs.pdf, wide, specular, sampler.next_1d(), active
+            vertex.cube, start.ray, wide, sampler.next_1d(), active
         )
     end = follow(scene, transport, sampler, start, active & (dr.max(weight) > 0))
     solid = active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)

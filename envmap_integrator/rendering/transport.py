@@ -24,7 +24,6 @@ import mitsuba as mi
 
 from ..jit import SpareNumbers
 from ..maps.far_field import Cube, FarField
-from ..radiosity.irradiance import IrradianceCache
 from ..radiosity.patches import Patches
 from ..radiosity.surface_points import ObjectIds
 
@@ -161,9 +160,7 @@ def follow(
     distance = mi.Float(dr.inf)
     active = mi.Bool(active)
 
-    while dr.hint(
-        active, exclude=[transport, patches, far_field], label="Trace near, look up far"
-    ):
+    while dr.hint(active, exclude=[transport, patches, far_field], label="Trace near, look up far"):
         # ---------------------- Trace near ----------------------
 
         spare = SpareNumbers(sampler.next_1d())
@@ -243,8 +240,8 @@ def follow(
 
         # ---------------------- End in the cache ----------------------
 
-        throughput *= bsdf_weight
-        eta *= bs.eta
+        throughput = dr.select(retrace, throughput, throughput * bsdf_weight)
+        eta = dr.select(retrace, eta, eta * bs.eta)
         valid |= hit & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         sampled_specular = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         wide = is_wide(si, bs.wo, bs.pdf) & ~sampled_specular
@@ -267,9 +264,7 @@ def follow(
         reach = mi.Float(dr.inf)
         if dr.hint(far_field is not None, mode="scalar"):
             cluster = cube.cluster
-            bounded, ray.maxt, reach = far_field.bound(
-                cube, ray, pdf, wide, specular, spare.next_1d(), ~retrace
-            )
+            bounded, ray.maxt, reach = far_field.bound(cube, ray, wide, spare.next_1d(), ~retrace)
         reach = dr.select(counted, -1, reach)
         active &= retrace | (hit & ~ends & (dr.max(throughput) != 0))
 
@@ -315,7 +310,11 @@ class Vertex:
         cached = wide & self.served
         alone = cached
         if self.cube is not None:
-            alone |= wide & (self.cube.exit(self.si.p, ds.d) < ds.dist)
+            # The distance of an environment is made up.
+            infinite = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+            alone |= (
+                wide & self.cube.valid & (infinite | (self.cube.exit(self.si.p, ds.d) < ds.dist))
+            )
         mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, dr.select(alone, 0, bsdf_pdf)))
         light = bsdf_value * em_weight * mis
         active = active & (ds.pdf != 0) & ~(cached & self.lit) & (dr.max(light) > 0)

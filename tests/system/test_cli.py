@@ -30,6 +30,9 @@ SCENE = """
 </scene>
 """
 PATH = '<integrator type="path"> <integer name="max_depth" value="2"/> </integrator>'
+PAIR = """<bsdf type="diffuse" id="grey"/>
+    <shape type="rectangle" id="left"> <ref id="grey"/> </shape>
+    <shape type="rectangle" id="right"> <ref id="grey"/> </shape>"""
 UNKNOWN = '<integrator type="no_such_plugin"> <float name="strange" value="1"/> </integrator>'
 
 
@@ -88,6 +91,33 @@ def test_a_scene_without_integrator_gets_ours(tmp_path):
     mi.set_variant("llvm_ad_rgb")
     scene_file = SceneFile(write_scene(tmp_path, ""))
     assert scene_file.integrator.plugin_name() == "envmap_hybrid"
+
+
+def test_listed_clusters_keep_the_ids_of_shapes(tmp_path):
+    """Meshes that share a material are merged otherwise, and the merged mesh has no id."""
+    integrator = """<integrator type="envmap_hybrid">
+            <integer name="patches" value="256"/>
+            <emitter type="mipmap_cube" id="pair">
+                <string name="shapes" value="left, right"/>
+            </emitter>
+        </integrator>"""
+    scene = write_scene(tmp_path, PAIR + integrator)
+    assert run("bake", scene, "-o", tmp_path / "state.exr", "--set", "map_resolution=8") == 0
+
+    scene_file = SceneFile(scene)
+    assert {"left", "right"} <= {shape.id() for shape in scene_file.load().shapes()}
+    scene_file.configure_integrator("path")
+    assert not {"left", "right"} & {shape.id() for shape in scene_file.load().shapes()}
+
+
+def test_a_baked_state_serves_later_renders(tmp_path):
+    """Merging puts the shapes in another order each time."""
+    scene = write_scene(tmp_path, PAIR)
+    state = tmp_path / "state.exr"
+    options = ("--integrator", "source_selection", "--set", "patches=256")
+    assert run("bake", scene, "-o", state, *options) == 0
+    for _ in range(3):
+        assert run("render", scene, "--spp", 1, *options, "--set", f"cache_file={state}") == 0
 
 
 def test_films_can_be_resized(scene):

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from envmap_integrator.maps.clusters import Cluster
 from envmap_integrator.maps.cube import face_to_direction, n_levels
 from envmap_integrator.maps.cube_map import CubeMap
-from envmap_integrator.maps.far_field import HAND_OFF, MIN_LOBE_TEXELS, FarField, far_field
+from envmap_integrator.maps.far_field import HAND_OFF, FarField, far_field
 from envmap_integrator.maps.mipmap import build_levels
 from tests.helpers import at, block, grey, lamp, load, scaled
 from tests.unit.kit import scene_of
@@ -197,43 +197,34 @@ def test_a_wrong_distance_is_not_trusted(random):
 # ---------------------- Bounds ----------------------
 
 
-def bound(field, o, d, cell=0, pdf=0.3, specular=False, u=0.0):
+def bound(field, o, d, cell=0, wide=True, u=0.0):
     count = len(d)
+    everywhere = dr.full(mi.Bool, True, count)
     ray = mi.Ray3f(mi.Point3f(o.T.astype(np.float32)), mi.Vector3f(d.T.astype(np.float32)))
-    _, bounded, maxt = field.bound(
-        dr.full(mi.UInt32, cell, count),
-        ray,
-        mi.Float(pdf),
-        mi.Bool(specular),
-        mi.Float(u),
-        dr.full(mi.Bool, True, count),
-    )
-    return bounded.numpy(), maxt.numpy()
+    cube = field.cube(dr.full(mi.UInt32, cell, count), ray.o, everywhere)
+    bounded, maxt, reach = field.bound(cube, ray, mi.Bool(wide), mi.Float(u), everywhere)
+    return bounded.numpy(), maxt.numpy(), reach.numpy()
 
 
 def test_rays_end_at_their_cube_or_a_little_beyond(random):
     field = field_of(constant_levels(1, 1, 1, 0))
     o, d = rays_from_the_cube(random, 1000)
     for u in (0.0, 1.0):
-        bounded, maxt = bound(field, o, d, u=u)
+        bounded, maxt, reach = bound(field, o, d, u=u)
         assert bounded.all()
-        end = np.abs(o + maxt[:, None] / (1 + HAND_OFF * u) * d - CENTRE).max(axis=1)
-        assert_allclose(end, CUBE, rtol=1e-5)
+        assert_allclose(maxt, reach * (1 + HAND_OFF * u), rtol=1e-6)
+        assert_allclose(np.abs(o + reach[:, None] * d - CENTRE).max(axis=1), CUBE, rtol=1e-5)
 
 
 @pytest.mark.parametrize(
-    ("options", "why"),
-    [
-        ({"cell": 1}, "belongs to no cluster"),
-        ({"specular": True}, "a mirror"),
-        ({"pdf": 1.01 * RESOLUTION**2 / 4 / MIN_LOBE_TEXELS}, "narrower than texels"),
-    ],
+    ("options", "why"), [({"cell": 1}, "belongs to no cluster"), ({"wide": False}, "a mirror")]
 )
 def test_rays_that_no_map_can_serve_are_traced_in_full(random, options, why):
     field = field_of(constant_levels(1, 1, 1, 0))
-    bounded, maxt = bound(field, *rays_from_the_cube(random, 100), **options)
+    bounded, maxt, reach = bound(field, *rays_from_the_cube(random, 100), **options)
     assert not bounded.any()
     assert (maxt > 1e30).all()
+    assert np.isinf(reach).all()
 
 
 def test_rays_from_outside_their_cube_are_traced_in_full(random):
@@ -242,20 +233,21 @@ def test_rays_from_outside_their_cube_are_traced_in_full(random):
     assert not bound(field, o + [2 * CUBE, 0, 0], d)[0].any()
 
 
-def test_mirrors_may_read_the_map(random):
+def test_mirrors_may_read_the_map_and_count_all_sources(random):
     field = field_of(constant_levels(1, 1, 1, 0), mirrors=True)
-    o, d = rays_from_the_cube(random, 100)
-    assert bound(field, o, d, specular=True)[0].all()
-    assert bound(field, o, d, pdf=1e6)[0].all()
+    bounded, _, reach = bound(field, *rays_from_the_cube(random, 100), wide=False)
+    assert bounded.all()
+    assert np.isinf(reach).all()
 
 
 # ---------------------- Sources ----------------------
 
 
 def reached(scene: mi.Scene, towards) -> tuple[mi.SurfaceInteraction3f, bool]:
-    field = field_of(constant_levels(1, 1, 1, 0), scene)
+    field = field_of(constant_levels(1, 1, 1, 0), scene, mirrors=True)
     ray = mi.Ray3f(mi.Point3f(0, 0, 0), mi.Vector3f(*map(float, towards)))
     si, found = field.intersect_sources(scene, ray, mi.Bool(True))
+    dr.eval(si, found)  # While the scene of the sources is there.
     return si, bool(found.numpy().any())
 
 
@@ -264,10 +256,11 @@ def lit_hall(**more) -> mi.Scene:
 
 
 def test_a_source_is_reached():
-    si, found = reached(lit_hall(), (0, 0, 1))
+    scene = lit_hall()
+    si, found = reached(scene, (0, 0, 1))
     assert found
     assert si.t.numpy() == pytest.approx(2)
-    assert si.emitter(lit_hall()) is not None
+    assert dr.all(si.emitter(scene) == scene.emitters()[0])
 
 
 @pytest.mark.parametrize("towards", [(1, 0, 0), (0, 0, -1)])
@@ -295,7 +288,7 @@ SKY = {"type": "constant"}
 
 def test_the_scene_keeps_the_ids_of_its_sources():
     scene = lit_hall()
-    field_of(constant_levels(1, 1, 1, 0), scene)
+    field_of(constant_levels(1, 1, 1, 0), scene, mirrors=True)
     assert sorted(shape.id() for shape in scene.shapes()) == ["lamp", "stage"]
     assert reached(scene, (0, 0, 1))[1]
 
