@@ -25,7 +25,7 @@ VOXEL = 1 / 40
 MIN_SEEN = 0.005
 MAX_CLUSTERS = 8
 #: Voxels considered, most seen first: bounds the cost of hierarchical clustering.
-MAX_VOXELS = 3000
+MAX_VOXELS = 1500
 
 
 @dataclass(frozen=True)
@@ -102,9 +102,8 @@ def find_clusters(points: SurfacePoints, distance_ratio: float) -> tuple[list[Cl
         return [], cluster_of_point
 
     # ---- Voxels of what isn't surroundings ----
-    cell = np.floor(points.position[contents] / (VOXEL * extent)).astype(np.int64)
-    _, voxel = np.unique(cell, axis=0, return_inverse=True)
-    voxel = voxel.ravel()
+    cell = np.floor(points.position[contents] / (VOXEL * extent))
+    _, voxel = np.unique(_joined(cell.T), return_inverse=True)
     seen = np.bincount(voxel, weights=points.seen[contents])
     n_points = np.bincount(voxel)
     centre = np.stack(
@@ -152,20 +151,24 @@ def _on_large_plane(points: SurfacePoints, extent: float) -> np.ndarray:
     """Which points [N] lie on flat pieces that are large compared to the scene."""
     offset = (points.position * points.normal).sum(axis=1)
     # Shifted bins: normals and offsets of buildings sit on round numbers.
-    key = np.column_stack(
-        [
-            points.object_id,
-            np.floor(points.normal * 8 + 0.377),
-            np.floor(offset * (200 / extent) + 0.377),
-        ]
-    ).astype(np.int64)
-    _, plane = np.unique(key, axis=0, return_inverse=True)
-    plane = plane.ravel()
+    normal = np.floor(points.normal * 8 + 0.377)
+    bins = (*normal.T, np.floor(offset * (200 / extent) + 0.377), points.object_id)
+    _, plane = np.unique(_joined(bins), return_inverse=True)
     n_planes = int(plane.max()) + 1
     lowest, highest = np.full((n_planes, 3), np.inf), np.full((n_planes, 3), -np.inf)
     np.minimum.at(lowest, plane, points.position)
     np.maximum.at(highest, plane, points.position)
     return (np.linalg.norm(highest - lowest, axis=1) > LARGEST_PLANE * extent)[plane]
+
+
+def _joined(columns) -> np.ndarray:
+    """One integer [N] in place of several [K, N]: sorting rows as wholes takes ten times as long."""
+    key = np.zeros(len(columns[0]), dtype=np.int64)
+    for column in columns:
+        column = column.astype(np.int64)
+        column -= column.min()
+        key = key * (int(column.max()) + 1) + column
+    return key
 
 
 def _cluster(name: str, position: np.ndarray, distance_ratio: float) -> Cluster:

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 #: Relative change of the irradiance at which the solution counts as converged.
 TOLERANCE = 1e-5
 MAX_ITERATIONS = 256
+#: Steps of the R2 sequence (Roberts 2018).
+R2 = (0.7548776662466927, 0.5698402909980532)
 #: Gather rays per kernel launch: bounds memory.
 MAX_LANES = 1 << 22
 
@@ -96,20 +98,17 @@ def _gather(scene, transport, members, begin, end, samples, seed):
     k = lane & (dr.opaque(mi.UInt32, samples) - 1)
     si = members.sample(dr.opaque(mi.UInt32, begin) + rank, sampler.next_1d())
 
-    # ---- Direction: cosine, stratified over the rays of a patch ----
-    rotation = [
-        mi.sample_tea_float32(rank, dr.opaque(mi.UInt32, 2 * seed + i), 4) for i in range(2)
-    ]
-    u = mi.Point2f(
-        mi.Float(k) / dr.opaque(mi.Float, samples) + rotation[0],
-        mi.radical_inverse_2(k, 0) + rotation[1],
-    )
-    wo = mi.warp.square_to_cosine_hemisphere(u - dr.floor(u))
+    # ---- Low-discrepancy numbers, rotated at random for each patch (Cranley-Patterson) ----
+    u = _rotated(mi.Float(k) / dr.opaque(mi.Float, samples), mi.radical_inverse_2(k, 0), rank, seed)
+    v = _rotated(mi.Float(k) * R2[0], mi.Float(k) * R2[1], rank, ~seed & 0xFFFFFFFF)
+
+    # ---- Direction: cosine ----
+    wo = mi.warp.square_to_cosine_hemisphere(u)
     pdf = mi.warp.square_to_cosine_hemisphere_pdf(wo)
     direction = si.to_world(wo)
 
     # ---- Direct light, by shadow rays and by the gather rays that hit a source ----
-    ds, light = sample_irradiance(scene, si, sampler.next_2d())
+    ds, light = sample_irradiance(scene, si, v)
     cosine = dr.maximum(dr.dot(si.sh_frame.n, ds.d), 0)
     direct = light * dr.select(ds.delta, 1, mis_weight(ds.pdf, cosine * dr.inv_pi))
 
@@ -135,6 +134,16 @@ def _gather(scene, transport, members, begin, end, samples, seed):
     weight = type(end_.weight)(*(finite(c) for c in end_.weight))
     dr.eval(direct, escaped, weight, end_.row)
     return direct, escaped, weight, end_.row
+
+
+def _rotated(x, y, rank, seed) -> mi.Point2f:
+    """A point set moved round the unit square, by another shift for every patch."""
+    shift = mi.Point2f(
+        mi.sample_tea_float32(2 * rank, dr.opaque(mi.UInt32, seed), 4),
+        mi.sample_tea_float32(2 * rank + 1, dr.opaque(mi.UInt32, seed), 4),
+    )
+    point = mi.Point2f(x, y) + shift
+    return point - dr.floor(point)
 
 
 def sample_irradiance(scene, si, u):
