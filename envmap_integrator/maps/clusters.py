@@ -162,7 +162,7 @@ def _on_large_plane(points: SurfacePoints, extent: float) -> np.ndarray:
 
 
 def _joined(columns) -> np.ndarray:
-    """One integer [N] in place of several [K, N]: sorting rows as wholes takes ten times as long."""
+    """One integer [N] in place of several [K, N]: sorting whole rows takes ten times as long."""
     key = np.zeros(len(columns[0]), dtype=np.int64)
     for column in columns:
         column = column.astype(np.int64)

@@ -45,20 +45,24 @@ def drop_uneven(
     irradiance = finite(dr.mean(light))
     dr.eval(irradiance, si.p)
 
-    irradiance = irradiance.numpy().reshape(n_patches, SAMPLES)
-    position = si.p.numpy().T.reshape(n_patches, SAMPLES, 3)
-    mean, error, _ = _statistics(irradiance, np.ones_like(irradiance, dtype=bool))
-    lit = (irradiance > 0).mean(axis=1)
+    irradiance, position = irradiance.numpy().astype(np.float64), si.p.numpy().T
+    patch = np.repeat(np.arange(n_patches), SAMPLES)
+    mean, error, n = _statistics(irradiance, patch, n_patches)
+    lit = np.bincount(patch, irradiance > 0, n_patches) / n
     uneven = np.zeros(n_patches, dtype=bool)
     for axis in range(3):
-        x = position[..., axis]
+        x = position[:, axis].reshape(n_patches, SAMPLES)
         low, high = x.min(axis=1, keepdims=True), x.max(axis=1, keepdims=True)
-        slice_ = np.minimum(SLICES * (x - low) / np.maximum(high - low, 1e-30), SLICES - 1)
-        for index in range(SLICES):
-            part, part_error, n = _statistics(irradiance, slice_.astype(int) == index)
-            contrast = (part > CONTRAST * mean) | (mean > CONTRAST * part)
-            certain = np.abs(part - mean) > SIGNIFICANCE * np.hypot(part_error, error)
-            uneven |= contrast & certain & (n * lit >= MIN_LIT)
+        index = np.minimum(SLICES * (x - low) / np.maximum(high - low, 1e-30), SLICES - 1)
+        slice_ = patch * SLICES + index.astype(np.int64).ravel()
+        part, part_error, n = (
+            values.reshape(n_patches, SLICES)
+            for values in _statistics(irradiance, slice_, n_patches * SLICES)
+        )
+        contrast = (part > CONTRAST * mean[:, None]) | (mean[:, None] > CONTRAST * part)
+        doubt = SIGNIFICANCE * np.hypot(part_error, error[:, None])
+        certain = (np.abs(part - mean[:, None]) > doubt) & (n * lit[:, None] >= MIN_LIT)
+        uneven |= (contrast & certain).any(axis=1)
 
     dropped = members.patches[uneven]
     cells = patches.cells.numpy()
@@ -67,9 +71,9 @@ def drop_uneven(
     return replace(patches, cells=upload(mi.UInt32, cells)), np.where(kept, patch_of_point, -1)
 
 
-def _statistics(values: np.ndarray, where: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Mean, its standard error and the number [P] of the chosen values [P, S] of each patch."""
-    n = where.sum(axis=1)
-    mean = np.where(where, values, 0).sum(axis=1) / np.maximum(n, 1)
-    square = np.where(where, (values - mean[:, None]) ** 2, 0).sum(axis=1)
+def _statistics(values: np.ndarray, group: np.ndarray, n_groups: int) -> tuple[np.ndarray, ...]:
+    """Mean, its standard error, and number [G] of the values [N] in each group [N]."""
+    n = np.bincount(group, minlength=n_groups)
+    mean = np.bincount(group, values, n_groups) / np.maximum(n, 1)
+    square = np.bincount(group, (values - mean[group]) ** 2, n_groups)
     return mean, np.sqrt(square / np.maximum(n - 1, 1) / np.maximum(n, 1)), n
