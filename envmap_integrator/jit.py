@@ -6,19 +6,27 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+#: Alignment [bytes] of Dr.Jit's own memory.
+_ALIGNMENT = 64
+
 
 def upload(dtype: type, values: np.ndarray) -> mi.Float | mi.UInt32:
-    """A one-dimensional Dr.Jit array of NumPy values, in memory of Dr.Jit's own.
+    """A one-dimensional Dr.Jit array of NumPy values.
 
-    A plain conversion would map NumPy's memory. Where that isn't aligned, packed gathers fall
-    apart into scalar ones, and kernels differ from run to run.
+    Dr.Jit maps NumPy's memory as it is. Where that isn't aligned, which is a matter of chance,
+    packed gathers fall apart into scalar ones and every kernel is compiled again.
     """
-    values = np.ascontiguousarray(values).ravel()
-    result = dr.empty(dtype, len(values))
-    if len(values):
-        dr.scatter(result, dtype(values), dr.arange(mi.UInt32, len(values)))
-        dr.eval(result)
-    return result
+    values = np.asarray(values, dtype=np.float32 if dr.is_float_v(dtype) else np.uint32).ravel()
+    memory = np.empty(values.nbytes + _ALIGNMENT, dtype=np.uint8)
+    begin = -memory.ctypes.data % _ALIGNMENT
+    aligned = memory[begin : begin + values.nbytes].view(values.dtype)
+    aligned[:] = values
+    return dtype(aligned)
+
+
+def upload_vectors(dtype: type, values: np.ndarray):
+    """A Dr.Jit array of vectors of the rows of NumPy values [N, 3]."""
+    return dtype(*(upload(mi.Float, component) for component in values.T))
 
 
 def opaque_point(values) -> mi.Point3f:

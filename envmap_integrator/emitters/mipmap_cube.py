@@ -137,7 +137,7 @@ class MipmapCube(mi.Emitter):
         weight = radiance * solid_angles(radiance.shape[1])
         # Bilinear filtering spreads a texel's light over its neighbours: no texel may be missed.
         weight += 0.05 * max(weight.mean(), 1e-30)
-        self._distribution = mi.DiscreteDistribution(mi.Float(weight.ravel()))
+        self._distribution = mi.DiscreteDistribution(upload(mi.Float, weight))
 
     def _pdf(self, d, active):
         resolution = self._sampling_resolution

@@ -78,7 +78,7 @@ def solve_irradiance(
         return IrradianceCache(transport.patches, table)
 
     direct, escaped, weight, row = (_concatenate(part) for part in zip(*parts, strict=True))
-    patch = upload(mi.UInt32, members.patches.astype(np.uint32))
+    patch = upload(mi.UInt32, members.patches)
     table = _solve(transport.patches.count, patch, direct, escaped, weight, row, samples)
     return IrradianceCache(transport.patches, table)
 

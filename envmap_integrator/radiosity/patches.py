@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..jit import mix, opaque_point, upload
+from ..jit import mix, opaque_point, upload, upload_vectors
 from .surface_points import ObjectIds, SurfacePoints
 
 #: Edge of the large cells as a fraction of the diagonal of the box that holds most surface points
@@ -154,9 +154,9 @@ def build_patches(
         empty = np.zeros(0, dtype=np.int64)
         return _no_patches(), empty, empty
     low, extent = points.bounds()
-    position = mi.Point3f(points.position.T)
-    normal = mi.Normal3f(points.normal.T)
-    object_id = mi.UInt32(points.object_id.astype(np.uint32))
+    position = upload_vectors(mi.Point3f, points.position)
+    normal = upload_vectors(mi.Normal3f, points.normal)
+    object_id = upload(mi.UInt32, points.object_id)
     size = extent * LARGE_CELL
     while True:
         # An irrational offset keeps walls, mostly at round coordinates, off the cell borders.
@@ -183,7 +183,7 @@ def build_patches(
     large_of_point = index_of_large[cell_of_point]
 
     # ---- Their cells are the patches ----
-    level_of_point = mi.UInt32(level[cell_of_point].astype(np.uint32))
+    level_of_point = upload(mi.UInt32, level[cell_of_point])
     key = _keys(patches, position, identity, level_of_point)
     cells, cell_of_point = np.unique(key, return_inverse=True)
     cells, patch_of_cell = _hash_table(cells)
