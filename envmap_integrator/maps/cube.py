@@ -20,9 +20,9 @@ def n_levels(resolution: int) -> int:
     return resolution.bit_length()
 
 
-def n_texels(resolution: int) -> int:
+def n_texels(resolution):
     """Texels of all six faces and all levels."""
-    return 8 * resolution**2 - 2
+    return 8 * resolution * resolution - 2
 
 
 def level_offset(resolution, level_resolution):

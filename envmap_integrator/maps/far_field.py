@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..jit import upload
-from .cube import direction_to_face, exit_distance, face_to_direction, texel
+from .cube import direction_to_face, exit_distance, face_to_direction, n_texels, texel
 from .cube_map import CubeMap
 
 #: Steps of the fixed point iteration that finds the far hit (Szirmay-Kalos et al. 2005).
@@ -153,8 +153,8 @@ class FarField:
         return self._fetch(cluster, face, uv, self.resolution, active)[len(mi.Spectrum())]
 
     def _fetch(self, cluster, face, uv, level_resolution, active):
-        n_texels = 8 * self.resolution * self.resolution - 2
-        index = cluster * n_texels + texel(face, uv, self.resolution, level_resolution)
+        first = cluster * n_texels(self.resolution)
+        index = first + texel(face, uv, self.resolution, level_resolution)
         return dr.gather(texel_type(), self.texels, index, active)
 
 
