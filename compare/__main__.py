@@ -1,22 +1,45 @@
-"""``python -m compare render SCENE.xml``: pictures, errors and times of several integrators."""
+"""Experiments: what our integrators cost and how far they are off, beside ``path``."""
 
 from __future__ import annotations
 
 import argparse
 import sys
+import time
 from pathlib import Path
+from types import ModuleType
 
-from compare import render
+from compare import report
+from compare.experiments import (
+    algorithms,
+    complexity,
+    distance,
+    error_vs_time,
+    render,
+    resolution,
+)
+from compare.options import add_options, read_options
+from envmap_integrator.cli.commands import activate_variant
 from envmap_integrator.cli.errors import condense
 
+EXPERIMENTS: dict[str, ModuleType] = {
+    "resolution": resolution,
+    "distance": distance,
+    "algorithms": algorithms,
+    "error-vs-time": error_vs_time,
+    "complexity": complexity,
+    "render": render,
+}
+"""Each module has ``Options`` and ``run(options, folder)``; its docstring is the help."""
 
-def main() -> int:
+
+def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m compare", description=__doc__)
-    subparsers = parser.add_subparsers(required=True, metavar="EXPERIMENT")
-    _add_render(subparsers)
-    args = parser.parse_args()
+    subparsers = parser.add_subparsers(required=True, metavar="EXPERIMENT", dest="experiment")
+    for name, module in EXPERIMENTS.items():
+        _add_experiment(subparsers, name, module)
+    args = parser.parse_args(arguments)
     try:
-        args.experiment(args)
+        _run(EXPERIMENTS[args.experiment], args)
     except (ValueError, TypeError, RuntimeError, ImportError, OSError) as error:
         if args.debug:
             raise
@@ -25,47 +48,33 @@ def main() -> int:
     return 0
 
 
-def _add_render(subparsers: argparse._SubParsersAction) -> None:
-    parser = subparsers.add_parser("render", help="equal samples, against a path traced reference")
-    parser.add_argument("scene", type=Path, metavar="SCENE.xml")
-    parser.add_argument(
-        "--integrators", nargs="+", default=["envmap_hybrid", "path"], metavar="NAME",
-        help="the first is the one whose error the picture shows",
-    )  # fmt: skip
-    parser.add_argument("--spp", type=int, default=64)
-    parser.add_argument("--reference-spp", type=int, default=512, help="of each of its two halves")
-    parser.add_argument("--size", type=_size, default=(320, 240), metavar="WxH")
-    parser.add_argument("--runs", type=int, default=3, help="timed runs of each integrator")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=Path("renders"))
+def _add_experiment(subparsers: argparse._SubParsersAction, name: str, module: ModuleType) -> None:
+    summary = module.__doc__.splitlines()[0]
+    parser = subparsers.add_parser(name, help=summary, description=module.__doc__)
+    if hasattr(module, "SCENES"):
+        parser.add_argument(
+            "scenes", nargs="*", type=Path, default=module.SCENES, metavar="SCENE.xml"
+        )
+    add_options(parser, module.Options)
+    parser.add_argument("--quick", action="store_true", help="a look in minutes: less of it all")
+    parser.add_argument("--out", type=Path, default=Path("renders"), help="folder of the results")
     parser.add_argument("-m", "--mode", default="llvm_ad_rgb", metavar="VARIANT")
-    parser.add_argument("--quick", action="store_true", help="a look in seconds: few samples")
     parser.add_argument("--debug", action="store_true", help="show tracebacks")
-    parser.set_defaults(experiment=_render)
 
 
-def _render(args: argparse.Namespace) -> None:
-    render.compare(
-        render.Experiment(
-            scene=args.scene,
-            integrators=tuple(dict.fromkeys(args.integrators)),
-            spp=16 if args.quick else args.spp,
-            reference_spp=64 if args.quick else args.reference_spp,
-            size=args.size,
-            runs=args.runs,
-            seed=args.seed,
-            variant=args.mode,
-        ),
-        args.out,
-    )
+def _run(module: ModuleType, args: argparse.Namespace) -> None:
+    options = read_options(args, module.Options)
+    activate_variant(args.mode)
+    start = time.perf_counter()
+    for outcome in module.run(options, args.out, **_scenes(args)):
+        report.show(outcome)
+        report.write(outcome, args.out)
+        print(f"wrote {args.out / outcome.name}.html, .json, *.png, *.exr")
+    print(f"{args.experiment} took {time.perf_counter() - start:.0f} s")
 
 
-def _size(text: str) -> tuple[int, int]:
-    try:
-        width, height = map(int, text.split("x"))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f'expected WxH, such as 320x240, got "{text}"') from None
-    return width, height
+def _scenes(args: argparse.Namespace) -> dict[str, tuple[Path, ...]]:
+    return {"scenes": tuple(args.scenes)} if hasattr(args, "scenes") else {}
 
 
 if __name__ == "__main__":

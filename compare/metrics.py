@@ -25,32 +25,70 @@ class Estimate:
     margin: float
 
 
-def rel_mse(picture: Picture, half_a: Picture, half_b: Picture) -> float:
+def rel_mse(picture: Picture, half_a: Picture, half_b: Picture, tile: int = 1) -> float:
     """relMSE = mean((I-R)² / (R² + ε·mean(R)²)) against the unknown noise-free reference R.
 
     The two halves A, B of the reference have independent errors, so (I-A)(I-B) has the expectation
     (I-R)²: no reference noise is counted as ours. (Near zero error it may come out negative.)
-    The denominator takes R = (A+B)/2.
+    The denominator takes R = (A+B)/2. ``tile`` > 1 compares averages over tiles of that many
+    pixels squared.
     """
-    a, b = half_a.astype(np.float64), half_b.astype(np.float64)
-    reference = (a + b) / 2
-    squared_error = (picture - a) * (picture - b)
-    scale = reference**2 + REL_MSE_EPSILON * reference.mean() ** 2
-    return float(np.mean(squared_error / scale))
+    return _error_product(picture, picture, half_a, half_b, tile)
 
 
-def mean_bias(pictures: list[Picture], reference_parts: list[Picture]) -> Estimate:
+def error_floor(pictures: list[Picture], half_a: Picture, half_b: Picture, tile: int = 1) -> float:
+    """relMSE that is left of the mean of infinitely many such pictures.
+
+    Two pictures of independent seeds share nothing but their bias: the mean over all pairs of
+    (I-A)(J-B) is free of the noise of either. (With no bias it may come out negative.)
+    """
+    total, n = np.sum(pictures, axis=0, dtype=np.float64), len(pictures)
+    own = sum(_error_product(p, p, half_a, half_b, tile) for p in pictures)
+    mean = total / n
+    return (n * n * _error_product(mean, mean, half_a, half_b, tile) - own) / (n * (n - 1))
+
+
+def rel_mse_of_difference(picture: Picture, other: Picture) -> float:
+    """relMSE of the difference of two pictures, relative to their mean."""
+    mean = (picture.astype(np.float64) + other) / 2
+    return float(np.mean((picture.astype(np.float64) - other) ** 2 / _scale(mean)))
+
+
+def _error_product(i, j, half_a, half_b, tile) -> float:
+    i, j, a, b = (tiles(p, tile).astype(np.float64) for p in (i, j, half_a, half_b))
+    return float(np.mean((i - a) * (j - b) / _scale((a + b) / 2)))
+
+
+def _scale(reference):
+    return reference**2 + REL_MSE_EPSILON * reference.mean() ** 2
+
+
+def tiles(picture: Picture, size: int) -> Picture:
+    """Averages over squares of ``size`` pixels; what is left at the border is dropped."""
+    height, width = (n // size * size for n in picture.shape[:2])
+    blocks = picture[:height, :width].reshape(height // size, size, width // size, size, -1)
+    return blocks.mean(axis=(1, 3))
+
+
+def mean_bias(pictures: list[Picture], part_means: list[float]) -> Estimate:
     """Relative error of the picture's mean over independent seeds: Welch's t interval.
 
-    ``reference_parts`` are independent equally sampled parts of the reference.
+    ``part_means`` are means of independent, equally sampled parts of the reference.
     """
     ours = np.array([picture.mean(dtype=np.float64) for picture in pictures])
-    theirs = np.array([part.mean(dtype=np.float64) for part in reference_parts])
+    theirs = np.array(part_means)
     scale = theirs.mean()
     interval = stats.ttest_ind(ours / scale, theirs / scale, equal_var=False).confidence_interval()
     return Estimate(
         value=float(ours.mean() / scale - 1), margin=float(interval.high - interval.low) / 2
     )
+
+
+def estimate(values) -> Estimate:
+    """Mean of independent values, with Student's t interval."""
+    values = np.asarray(values, dtype=np.float64)
+    margin = stats.t.ppf(0.975, len(values) - 1) * stats.sem(values) if len(values) > 1 else np.inf
+    return Estimate(float(values.mean()), float(margin))
 
 
 def signed_error(picture: Picture, reference: Picture) -> NDArray[np.float64]:

@@ -1,73 +1,120 @@
-"""A comparison's numbers, for people and for programs."""
+"""What an experiment hands over, and the files made of it."""
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 import platform
-from dataclasses import asdict
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import drjit as dr
+import jinja2
 import mitsuba as mi
+import numpy as np
+from matplotlib.figure import Figure
 from rich.console import Console
-from rich.table import Table
+from rich.table import Table as RichTable
 
 import envmap_integrator
-from compare.records import Experiment, Measurements, Result
+from compare.figures import exposure, png, srgb
+from compare.metrics import Picture
 from envmap_integrator.cli.output import replacing
 
-WIDTH = 100
-"""Of the table where no terminal sets it [characters]."""
+SCHEMA = 1
+"""Version of the JSON files' layout."""
+
+WIDTH = 110
+"""Of tables where no terminal sets it [characters]."""
 
 
-def print_table(experiment: Experiment, results: list[Result]) -> None:
-    """Print one row an integrator and, where ``path`` takes part, the speed-ups against it."""
-    table = Table(
-        title=f"{experiment.scene.name}, {'×'.join(map(str, experiment.size))}; times in s"
-    )
-    table.add_column("integrator", no_wrap=True)
-    for heading in ("spp", "prepare", "render", "total", "compile", "relMSE", "bias %"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    for result in results:
-        table.add_row(
-            result.integrator,
-            str(result.spp),
-            f"{result.prepare_s:.2f}",
-            f"{result.render_s:.2f}",
-            f"{result.total_s:.2f}",
-            f"{result.compile_s:.1f}" if result.compile_s > 0 else "cached",
-            f"{result.rel_mse:.2e}",
-            f"{100 * result.bias.value:+.2f} ± {100 * result.bias.margin:.2f}",
-        )
+@dataclass(frozen=True)
+class Table:
+    """Text under headings; ``note`` says what the reader has to know."""
+
+    title: str
+    columns: list[str]
+    rows: list[list[str]]
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Illustration:
+    """A figure, and what it shows; ``name`` ends the name of its PNG file."""
+
+    name: str
+    caption: str
+    figure: Figure
+
+
+@dataclass(frozen=True)
+class Slider:
+    """Two pictures to be wiped over each other, in the exposure of ``reference``."""
+
+    title: str
+    left: tuple[str, Picture]
+    right: tuple[str, Picture]
+    reference: Picture
+
+
+@dataclass
+class Report:
+    """The outcome of one experiment.
+
+    name      of its files
+    title     what was asked
+    findings  what was found, one paragraph each
+    settings  everything needed to repeat it
+    numbers   everything measured, as JSON takes it
+    figures   plots and rows of pictures
+    pictures  name → radiance, for OpenEXR files
+    """
+
+    name: str
+    title: str
+    settings: dict[str, object]
+    findings: list[str] = field(default_factory=list)
+    tables: list[Table] = field(default_factory=list)
+    figures: list[Illustration] = field(default_factory=list)
+    sliders: list[Slider] = field(default_factory=list)
+    pictures: dict[str, Picture] = field(default_factory=dict)
+    numbers: dict[str, object] = field(default_factory=dict)
+
+
+def write(report: Report, folder: Path) -> None:
+    """Write JSON, PNG, EXR and one self-contained HTML file."""
+    folder.mkdir(parents=True, exist_ok=True)
+    _write_text(folder / f"{report.name}.json", json.dumps(_document(report), indent=1) + "\n")
+    images = [(illustration, png(illustration.figure)) for illustration in report.figures]
+    for illustration, data in images:
+        with replacing(folder / f"{report.name}-{illustration.name}.png") as temporary:
+            temporary.write_bytes(data)
+    for name, picture in report.pictures.items():
+        with replacing(folder / f"{report.name}-{name}.exr") as temporary:
+            mi.Bitmap(np.ascontiguousarray(picture, np.float32)).write(str(temporary))
+    _write_text(folder / f"{report.name}.html", _html(report, images))
+
+
+def show(report: Report) -> None:
+    """Print tables and findings."""
     console = Console()
     if not console.is_terminal:
         console = Console(width=WIDTH)
-    console.print(table)
-    path = next((result for result in results if result.integrator == "path"), None)
-    for result in results:
-        if path and result is not path:
-            console.print(_speed_up(result, path), highlight=False)
+    for table in report.tables:
+        grid = RichTable(title=table.title, caption=table.note or None)
+        for index, column in enumerate(table.columns):
+            grid.add_column(column, justify="right" if index else "left")
+        for row in table.rows:
+            grid.add_row(*row)
+        console.print(grid)
+    for paragraph in report.findings:
+        console.print(paragraph, highlight=False, markup=False)
 
 
-def _speed_up(result: Result, path: Result) -> str:
-    """Equal samples, and an estimate at equal error: that of ``path`` falls as 1/spp."""
-    faster = path.total_s / result.total_s
-    text = f"{result.integrator} against path: {faster:.2f}× as fast at equal samples"
-    if result.rel_mse > 0:
-        equal_error = path.prepare_s + path.render_s * path.rel_mse / result.rel_mse
-        text += f", about {equal_error / result.total_s:.1f}× at equal error"
-    return text
-
-
-def write_json(
-    path: Path, experiment: Experiment, measured: list[Measurements], results: list[Result]
-) -> None:
-    """Write every number, seed, setting and version."""
-    document = {
-        "experiment": asdict(experiment),
-        "results": [asdict(result) for result in results],
-        "runs": [measurements.numbers() for measurements in measured],
+def environment() -> dict[str, object]:
+    """Versions and machine."""
+    return {
         "versions": {
             "envmap_integrator": envmap_integrator.__version__,
             "mitsuba": mi.__version__,
@@ -79,7 +126,54 @@ def write_json(
             "platform": platform.platform(),
             "cores": os.cpu_count(),
             "threads": dr.thread_count(),
+            "variant": mi.variant(),
         },
     }
+
+
+def _document(report: Report) -> dict[str, object]:
+    document = {
+        "schema": SCHEMA,
+        "experiment": report.name,
+        "title": report.title,
+        "settings": report.settings,
+        "numbers": report.numbers,
+        "findings": report.findings,
+        **environment(),
+    }
+    return json.loads(json.dumps(document, default=_plain))
+
+
+def _plain(value: object) -> object:
+    """NumPy's numbers and dataclasses as JSON has them, anything else as text."""
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return vars(value) if hasattr(value, "__dataclass_fields__") else str(value)
+
+
+def _html(report: Report, images: list[tuple[Illustration, bytes]]) -> str:
+    loader = jinja2.FileSystemLoader(Path(__file__).parent)
+    template = jinja2.Environment(loader=loader, autoescape=True).get_template("report.html.j2")
+    sliders = []
+    for slider in report.sliders:
+        scale = exposure(slider.reference)
+        left, right = (_embed(png(srgb(p * scale))) for _, p in (slider.left, slider.right))
+        sliders.append((slider, left, right))
+    return template.render(
+        report=report,
+        images=[(illustration.caption, _embed(data)) for illustration, data in images],
+        sliders=sliders,
+        settings=json.dumps(report.settings, indent=1, default=_plain),
+        environment=json.dumps(environment(), indent=1),
+    )
+
+
+def _embed(data: bytes) -> str:
+    return "data:image/png;base64," + base64.b64encode(data).decode()
+
+
+def _write_text(path: Path, text: str) -> None:
     with replacing(path) as temporary:
-        temporary.write_text(json.dumps(document, indent=2, default=str) + "\n")
+        temporary.write_text(text)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -40,13 +41,28 @@ class SceneFile:
         return self._integrator_node.props
 
     def configure_integrator(
-        self, name: str | None = None, settings: Mapping[str, Any] | None = None
+        self,
+        name: str | None = None,
+        settings: Mapping[str, Any] | None = None,
+        keep: bool = True,
     ) -> None:
-        """Use the plugin ``name`` (None: the present one, with its parameters) and ``settings``."""
-        if name is not None and name != self.integrator.plugin_name():
+        """Use the plugin ``name`` (None: the present one) and ``settings``.
+
+        The present plugin's own parameters stay with it unless ``keep`` is False.
+        """
+        if name is not None and (name != self.integrator.plugin_name() or not keep):
             self._integrator_node.props = mi.Properties(name)
         for key, value in (settings or {}).items():
             self.integrator[key] = value
+
+    @property
+    def film_size(self) -> tuple[int, int]:
+        """Width and height [pixels] of the first film; Mitsuba's default where it has none."""
+        for node in self._state.nodes:
+            if node.type == mi.ObjectType.Film:
+                film = mi.Properties(node.props)
+                return film.get("width", 768), film.get("height", 576)
+        return 768, 576
 
     def configure_films(self, width: int, height: int) -> None:
         """Give every film this size [pixels], no crop window, and a box reconstruction filter."""
@@ -59,6 +75,26 @@ class SceneFile:
                 node.props = mi.Properties("box")
             if not filters:
                 self._append_child(film, mi.ObjectType.ReconstructionFilter, "box")
+
+    def configure_samplers(self, plugin: str) -> None:
+        """Have every sensor draw its sample points from ``plugin``; sample counts stay."""
+        for sampler in [node for node in self._state.nodes if node.type == mi.ObjectType.Sampler]:
+            count = sampler.props.get("sample_count", 16)
+            sampler.props = mi.Properties(plugin)
+            sampler.props["sample_count"] = count
+        for sensor in [node for node in self._state.nodes if node.type == mi.ObjectType.Sensor]:
+            if not self._children(sensor, mi.ObjectType.Sampler):
+                self._append_child(sensor, mi.ObjectType.Sampler, plugin)
+
+    def content_hash(self) -> str:
+        """Hash of the description as it is now and of the files that it names."""
+        digest = hashlib.blake2b(digest_size=10)
+        for node in self._state.nodes:
+            digest.update(str(node.props).encode())
+            name = mi.Properties(node.props).get("filename")
+            if name is not None and (self._folder / name).is_file():
+                digest.update((self._folder / name).read_bytes())
+        return digest.hexdigest()
 
     def load(self, merge_meshes: bool = True) -> mi.Scene:
         """Instantiate the scene.

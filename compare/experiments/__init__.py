@@ -1,0 +1,1 @@
+"""One module an experiment: ``Options``, and ``run``, which yields reports."""

@@ -1,0 +1,7 @@
+"""stub"""
+
+from compare.options import Options
+
+
+def run(options, folder):
+    return []

@@ -1,0 +1,95 @@
+"""What is rendered: a scene file, its size, its sample points."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+
+from envmap_integrator.cli.scene_file import SceneFile
+
+OWN_SCENES = Path(__file__).parents[1] / "scenes"
+PAPER_ROOM = OWN_SCENES / "paper_room.xml"
+
+BEST_SAMPLER = "multijitter"
+"""Of Mitsuba's samplers, the one with which ``path`` has the least error (see README.md)."""
+
+
+@dataclass(frozen=True)
+class View:
+    """A scene as all integrators see it: the same film, box filter and sampler for each.
+
+    path          scene description, XML
+    width         of the film [pixels]; its height follows from the scene's own film
+    parameters    values of its ``$name`` place-holders
+    sampler       plugin that draws the sample points
+    merge_meshes  False keeps shapes apart, so that their ids can be used
+    """
+
+    path: Path
+    width: int
+    parameters: Mapping[str, str] = field(default_factory=dict)
+    sampler: str = BEST_SAMPLER
+    merge_meshes: bool = True
+
+    @property
+    def name(self) -> str:
+        """Name of the file, or of its folder where the file is just called scene."""
+        return self.path.stem if self.path.stem != "scene" else self.path.resolve().parent.name
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the film [pixels]."""
+        width, height = SceneFile(self.path, self.parameters).film_size
+        return self.width, max(round(self.width * height / width), 1)
+
+    def load(self) -> mi.Scene:
+        """A new scene; its own integrator is ``path`` without a limit of depth."""
+        return self._file().load(self.merge_meshes)
+
+    def content_hash(self) -> str:
+        """Changes with everything that the picture depends on, but for the samples."""
+        return self._file().content_hash()
+
+    def hides_emitters(self) -> bool:
+        """Does the scene's integrator hide directly visible emitters?"""
+        own = SceneFile(self.path, self.parameters).integrator
+        return bool(own["hide_emitters"]) if "hide_emitters" in own else False
+
+    def _file(self) -> SceneFile:
+        scene_file = SceneFile(self.path, self.parameters)
+        # Ours have no limit of depth, so path gets none either.
+        hidden = self.hides_emitters()
+        scene_file.configure_integrator("path", {"hide_emitters": hidden}, keep=False)
+        scene_file.configure_films(*self.size)
+        scene_file.configure_samplers(self.sampler)
+        return scene_file
+
+
+@dataclass(frozen=True)
+class Subject:
+    """An integrator with its settings, as ``mi.load_dict`` takes them."""
+
+    integrator: str
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    label: str = ""
+
+    @property
+    def name(self) -> str:
+        """How tables and plots call it."""
+        return self.label or self.integrator
+
+    def make(self, hide_emitters: bool = False) -> mi.Integrator:
+        """A new integrator: nothing is prepared yet."""
+        return mi.load_dict(
+            {"type": self.integrator, "hide_emitters": hide_emitters, **self.settings}
+        )
+
+
+PATH = Subject("path")
+HYBRID = Subject("envmap_hybrid")
+ONE_LEVEL_PATH = Subject("one_level_path")
+SOURCE_SELECTION = Subject("source_selection")
