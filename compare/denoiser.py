@@ -16,17 +16,25 @@ def denoise(scene: mi.Scene, picture: Picture, spp: int, seed: int) -> Picture:
 
     Raises ``ImportError`` if the optional package mitsuba-oidn is missing.
     """
-    try:
-        import mitsuba_oidn
-    except ImportError:
-        raise ImportError("no denoiser: pip install 'envmap-integrator[compare]'") from None
     guide = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"})
     channels = np.array(
         mi.render(scene, integrator=guide, spp=min(spp, GUIDE_SPP), seed=seed), dtype=np.float32
     )
-    return mitsuba_oidn.denoise(
-        np.ascontiguousarray(picture, dtype=np.float32),
-        albedo=np.ascontiguousarray(np.clip(channels[:, :, -6:-3], 0, 1)),
-        normal=np.ascontiguousarray(channels[:, :, -3:]),
-        hdr=True,
+    return _filter(picture, np.clip(channels[:, :, -6:-3], 0, 1), channels[:, :, -3:])
+
+
+def warm_up(width: int, height: int) -> None:
+    """Have the denoiser set itself up for pictures of this size, which takes it a while."""
+    blank = np.zeros((height, width, 3))
+    _filter(blank, blank, blank)
+
+
+def _filter(picture: Picture, albedo: Picture, normal: Picture) -> Picture:
+    try:
+        import mitsuba_oidn
+    except ImportError:
+        raise ImportError("no denoiser: pip install mitsuba-oidn") from None
+    picture, albedo, normal = (
+        np.ascontiguousarray(image, dtype=np.float32) for image in (picture, albedo, normal)
     )
+    return mitsuba_oidn.denoise(picture, albedo=albedo, normal=normal, hdr=True)

@@ -30,8 +30,8 @@ def rel_mse(picture: Picture, half_a: Picture, half_b: Picture, tile: int = 1) -
 
     The two halves A, B of the reference have independent errors, so (I-A)(I-B) has the expectation
     (I-R)²: no reference noise is counted as ours. (Near zero error it may come out negative.)
-    The denominator takes R = (A+B)/2. ``tile`` > 1 compares averages over tiles of that many
-    pixels squared.
+    The denominator takes R = (A+B)/2, which leaves an error of the order of the square of the
+    reference's own relMSE. ``tile`` > 1 compares averages over tiles of that many pixels squared.
     """
     return _error_product(picture, picture, half_a, half_b, tile)
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import mitsuba as mi
 import numpy as np
 
-from compare.denoiser import denoise
+from compare.denoiser import denoise, warm_up
 from compare.metrics import Picture
 from compare.scenes import Subject
 from envmap_integrator.cli.timing import compilation_time, measure, record_kernels
@@ -123,6 +123,9 @@ def interleave(
     for each of them.
     """
     measured = [Measurements(task.subject, task.spp) for task in tasks]
+    for task in tasks:
+        if task.denoise:
+            warm_up(*task.scene.sensors()[0].film().crop_size())
     with record_kernels(), stage("timed runs", total=len(tasks) * n_runs) as advance:
         for index in range(n_runs):
             previous = None
