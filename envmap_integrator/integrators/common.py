@@ -27,7 +27,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
         parameters = Parameters(props)
         self.owner = parameters.owner
         self.patches = parameters.integer("patches", 16384, 16, 1 << 22)
-        self.patch_samples = parameters.power_of_two("patch_samples", 128, 1, 1 << 16)
+        self.patch_samples = parameters.power_of_two("patch_samples", 32, 1, 1 << 16)
         self.shadow_samples = parameters.integer("shadow_samples", 1, 1, 1 << 16)
         self.secondary_samples = 1
         self.cache_file = parameters.text("cache_file")

@@ -35,7 +35,7 @@ class EnvmapBake(CachedIntegrator):
          16384)
      * - patch_samples
        - |int|
-       - Gather rays and shadow rays per patch, a power of two; unused when nested. (Default: 128)
+       - Gather rays and shadow rays per patch, a power of two; unused when nested. (Default: 32)
      * - shadow_samples
        - |int|
        - Shadow rays where a bake ray hits. (Default: 1)

@@ -23,7 +23,7 @@ class OneLevelPath(CachedIntegrator):
        - Budget of patches of the coarse mesh, 16 … 4194304. (Default: 16384)
      * - patch_samples
        - |int|
-       - Gather rays and shadow rays per patch, a power of two. (Default: 128)
+       - Gather rays and shadow rays per patch, a power of two. (Default: 32)
      * - shadow_samples
        - |int|
        - Shadow rays at a camera hit. (Default: 1)
