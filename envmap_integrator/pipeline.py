@@ -39,6 +39,7 @@ class Settings:
     map_resolution: int = 0
     map_samples: int = 0
     distance_ratio: float = 0.0
+    map_mirrors: bool = False
     requests: tuple[ClusterRequest, ...] = ()
 
 
@@ -70,7 +71,9 @@ def prepare(scene: mi.Scene, key: str, settings: Settings, baker=None) -> Prepar
 
     with _timed(times, "coarse mesh"):
         object_ids = ObjectIds(scene)
-        points = scatter_points(scene, object_ids, POINTS_PER_PATCH * settings.patches)
+        points = scatter_points(
+            scene, object_ids, POINTS_PER_PATCH * settings.patches, settings.map_mirrors
+        )
         patches, patch_of_point, cell_of_point = build_patches(points, object_ids, settings.patches)
         patches, patch_of_point = drop_uneven(scene, patches, points, patch_of_point)
 

@@ -49,8 +49,8 @@ class EnvmapHybrid(CachedIntegrator):
          samples the sources there too. (Default: cache)
      * - lookup
        - |string|
-       - ``corrected`` finds the far hit by the distance in the map; ``plain`` looks up the bare
-         direction, as the paper does. (Default: corrected)
+       - ``corrected`` finds the far hit by the distance in the map; ``plain`` looks up the point
+         where the ray leaves the cube, as the paper does. (Default: corrected)
      * - mirrors
        - |string|
        - ``trace`` follows mirrors and narrow lobes in full; ``map`` looks them up like all
@@ -126,6 +126,7 @@ class EnvmapHybrid(CachedIntegrator):
             map_resolution=self.map_resolution,
             map_samples=self.baker.samples,
             distance_ratio=self.distance_ratio,
+            map_mirrors=self.mirrors == "map",
             requests=self.requests,
         )
 

@@ -9,6 +9,7 @@ import numpy as np
 from ..jit import opaque_point, upload
 from ..progress import stage
 from ..radiosity.surface_points import SurfacePoints
+from ..rendering.ray_counts import Ray, count
 from .clusters import Cluster
 from .cube import exit_distance, face_to_direction
 from .cube_map import CubeMap
@@ -74,7 +75,9 @@ def bake_map(
             si.p = dr.gather(mi.Point3f, position, k)
             si.n = dr.gather(mi.Normal3f, normals, k)
             reached = dr.dot(o - si.p, si.n) > 0
-            reached &= ~scene.ray_test(si.spawn_ray_to(o), reached)
+            ray = si.spawn_ray_to(o)
+            count(Ray.SURVEY, ray, reached)
+            reached &= ~scene.ray_test(ray, reached)
 
             radiance, distance = radiance_distance(sampler, mi.Ray3f(o, d), reached)
             value = [*radiance, dr.rcp(start + distance)]

@@ -61,13 +61,16 @@ def listed_clusters(
 ) -> tuple[list[Cluster], np.ndarray]:
     """The clusters that the user listed, and the cluster of every surface point [N], -1 if none.
 
+    One whose cube holds the whole scene is left out with a warning: it has nothing to map.
     Raises ``ValueError`` if a shape isn't in the scene, is listed twice or has no surface.
     """
     ids = [shape.id() for shape in ordered_shapes(scene)]
     clusters = []
-    cluster_of_object = np.full(len(ids), -1)
-    for index, request in enumerate(requests):
+    cluster_of_point = np.full(len(points), -1)
+    listed = np.zeros(len(ids), dtype=bool)
+    for request in requests:
         owner = f'mipmap_cube "{request.name}"'
+        members = np.zeros(len(ids), dtype=bool)
         for shape_id in request.shape_ids:
             if shape_id not in ids:
                 raise ValueError(
@@ -75,17 +78,26 @@ def listed_clusters(
                     "(Mitsuba merges meshes that share a material: load with optimize=False)"
                 )
             shape = ids.index(shape_id)
-            if cluster_of_object[shape] >= 0:
+            if listed[shape]:
                 raise ValueError(f'{owner}: shape "{shape_id}" is listed twice; list it once')
-            cluster_of_object[shape] = index
-        member = cluster_of_object[points.object_id] == index
+            listed[shape] = members[shape] = True
+        member = members[points.object_id]
         if not member.any():
             raise ValueError(
                 f"{owner}: no surface was found on {_some(request.shape_ids)}; is it empty?"
             )
         ratio = request.distance_ratio or distance_ratio
-        clusters.append(_cluster(request.name, points.position[member], ratio))
-    return clusters, cluster_of_object[points.object_id]
+        cluster = _cluster(request.name, points.position[member], ratio)
+        if _holds(cluster, points):
+            mi.Log(
+                mi.LogLevel.Warn,
+                f"{owner}: its cube holds the whole scene, so there is nothing to map; set a "
+                f'"distance_ratio" below {ratio:g}',
+            )
+            continue
+        cluster_of_point[member] = len(clusters)
+        clusters.append(cluster)
+    return clusters, cluster_of_point
 
 
 def find_clusters(points: SurfacePoints, distance_ratio: float) -> tuple[list[Cluster], np.ndarray]:
@@ -122,11 +134,10 @@ def find_clusters(points: SurfacePoints, distance_ratio: float) -> tuple[list[Cl
     best = [g for g in np.argsort(-share, kind="stable") if share[g] >= MIN_SEEN][:MAX_CLUSTERS]
 
     clusters = []
-    lowest, highest = points.position.min(axis=0), points.position.max(axis=0)
     for g in best:
         member = contents[np.isin(voxel, kept[group == g])]
         cluster = _cluster(f"cluster{len(clusters)}", points.position[member], distance_ratio)
-        if not _holds(cluster, lowest, highest):
+        if not _holds(cluster, points):
             cluster_of_point[member] = len(clusters)
             clusters.append(cluster)
     return clusters, cluster_of_point
@@ -177,8 +188,9 @@ def _cluster(name: str, position: np.ndarray, distance_ratio: float) -> Cluster:
     return Cluster(name, (low + high) / 2, radius, distance_ratio * radius)
 
 
-def _holds(cluster: Cluster, low: np.ndarray, high: np.ndarray) -> bool:
+def _holds(cluster: Cluster, points: SurfacePoints) -> bool:
     """Does the cube hold the whole scene, so that nothing is left for a map?"""
+    low, high = points.position.min(axis=0), points.position.max(axis=0)
     inside = (cluster.centre - cluster.half_width <= low) & (
         cluster.centre + cluster.half_width >= high
     )

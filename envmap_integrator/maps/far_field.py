@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..jit import upload
+from ..rendering.ray_counts import Ray, count
 from .cube import direction_to_face, exit_distance, face_to_direction, n_texels, texel
 from .cube_map import CubeMap
 
@@ -47,7 +48,7 @@ class FarField:
     n_samples          [1]       samples that share a pixel: spp times secondary samples
     mip_bias           [1]       levels added to the look-up
     map_mirrors        whether mirrors and narrow lobes read the map too (else traced)
-    corrected          whether look-ups use the distance (else the bare direction, as the paper)
+    corrected          whether look-ups use the distance (else where the ray leaves the cube)
     sources            scene of the emitters' shapes alone, for the mirrors that read the map
     has_environment    whether the scene has an environment emitter
     """
@@ -98,11 +99,13 @@ class FarField:
         """
         cube = dr.gather(mi.Vector4f, self.cubes, cluster, active)
         centre = mi.Point3f(cube.x, cube.y, cube.z)
-        far = mi.Vector3f(d)
+        offset = o - centre
         trusted = mi.Bool(True)
         footprint = mi.Float(1)
-        if self.corrected:
-            offset = o - centre
+        if not self.corrected:
+            far = offset + exit_distance(centre, cube.w, o, d) * d
+        else:
+            far = mi.Vector3f(d)
             b = dr.dot(offset, d)
             c = dr.squared_norm(offset)
             for _ in range(CORRECTION_STEPS):
@@ -142,10 +145,12 @@ class FarField:
         Cheap and exact: the ray meets a scene of emitters only, and visibility is tested where it
         hits one. Returns a surface interaction (invalid for the environment) and its visibility.
         """
+        count(Ray.SOURCE, ray, active)
         si = self.sources.ray_intersect(ray, active)
         found = active & (si.is_valid() | self.has_environment)
         ray = mi.Ray3f(ray)
         ray.maxt = dr.select(si.is_valid(), si.t * (1 - 1e-4), dr.largest(mi.Float))
+        count(Ray.SHADOW, ray, found)
         return si, found & ~scene.ray_test(ray, found)
 
     def _inverse_distance(self, cluster, d, active):

@@ -16,6 +16,7 @@ import numpy as np
 
 from ..jit import upload
 from ..progress import stage
+from ..rendering.ray_counts import Ray, count
 from .patch_points import PatchPoints
 from .patches import Patches
 from .surface_points import SurfacePoints
@@ -149,6 +150,7 @@ def _rotated(x, y, rank, seed) -> mi.Point2f:
 def sample_irradiance(scene, si, u):
     """One sample of the irradiance [W/m²] from sources at a point: ``(ds, irradiance)``."""
     ds, em_weight = scene.sample_emitter_direction(si, u, True)
+    count(Ray.SHADOW, ds, ds.pdf != 0)
     cosine = dr.maximum(dr.dot(si.sh_frame.n, ds.d), 0)
     return ds, em_weight * dr.select(dr.dot(si.n, ds.d) > 0, cosine, 0)
 

@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..jit import upload
+from ..rendering.ray_counts import Ray, count
 from ..scene_order import ordered_shapes
 
 #: Hits followed along each global line, and along each walk from a sensor.
@@ -85,14 +86,18 @@ class ObjectIds:
 
 
 def scatter_points(
-    scene: mi.Scene, object_ids: ObjectIds, count: int, seed: int = 0
+    scene: mi.Scene, object_ids: ObjectIds, count: int, mirrors: bool = False, seed: int = 0
 ) -> SurfacePoints:
     """Spread about ``count`` points over the surfaces of a scene.
 
     Half come from global lines, uniform in position and direction, which hit all surfaces in
     proportion to their area (Cauchy-Crofton; Sbert 1993). Half come from walks that start at the
-    scene's sensors and follow the BSDFs: that is where the renderer will ask.
+    scene's sensors and follow the BSDFs: that is where the renderer will ask. Mirrors and glass
+    get points only if ``mirrors`` is set.
     """
+    wanted = mi.BSDFFlags.Smooth
+    if mirrors:
+        wanted = wanted | mi.BSDFFlags.DeltaReflection
     sampler = mi.load_dict({"type": "independent"})
     sensors = scene.sensors()
     n_walks = max(count // (2 * WALK_HITS * max(len(sensors), 1)), 1)
@@ -105,11 +110,13 @@ def scatter_points(
             for index, sensor in enumerate(sensors):
                 sampler.seed(1009 * seed_ + index + 1, n_walks)
                 ray = _sensor_rays(sensor, sampler)
-                walks += _hits_along(scene, object_ids, sampler, ray, WALK_HITS, bounce=True)
+                walks += _hits_along(
+                    scene, object_ids, sampler, ray, WALK_HITS, wanted, bounce=True
+                )
         if sum(map(len, lines)) < (count // 2 if sensors else count):
             sampler.seed(1009 * seed_, n_lines)
             ray = _global_lines(scene, sampler)
-            lines += _hits_along(scene, object_ids, sampler, ray, LINE_HITS, bounce=False)
+            lines += _hits_along(scene, object_ids, sampler, ray, LINE_HITS, wanted, bounce=False)
     return SurfacePoints.concatenate(walks + lines)
 
 
@@ -135,14 +142,19 @@ def _hits_along(
     sampler: mi.Sampler,
     ray: mi.Ray3f,
     n_hits: int,
+    wanted: mi.BSDFFlags,
     bounce: bool,
 ) -> list[SurfacePoints]:
-    """Follow rays over ``n_hits`` hits, bouncing off surfaces or passing straight through them."""
+    """Follow rays over ``n_hits`` hits, bouncing off surfaces or passing straight through them.
+
+    Points are kept where the BSDF has any of the ``wanted`` flags.
+    """
     ctx = mi.BSDFContext()
     active = dr.full(mi.Bool, True, dr.width(ray))
     parts = []
     for _ in range(n_hits):
         dr.eval(ray, active)
+        count(Ray.SURVEY, ray, active)
         si = scene.ray_intersect(ray, active)
         active &= si.is_valid()
         bsdf = si.bsdf()
@@ -150,7 +162,7 @@ def _hits_along(
         normal = dr.select(facing, si.n, -si.n)
         shading_normal = si.sh_frame.n
         shading_normal = dr.mulsign(shading_normal, dr.dot(shading_normal, normal))
-        keep = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        keep = active & ((bsdf.flags() & int(wanted)) != 0)
         keep &= dr.all(dr.isfinite(si.p)) & dr.all(dr.isfinite(shading_normal))
         keep &= dr.squared_norm(normal) > 0.5
         objects = object_ids(si)

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..radiosity.irradiance import IrradianceCache
+from .ray_counts import Ray, count
 from .transport import (
     PathEnd,
     PathState,
@@ -55,6 +56,7 @@ def split(scene, transport, cache, sampler, ray, active, secondary_samples):
     """
     # ---------------------- First vertex ----------------------
 
+    count(Ray.PRIMARY, ray, active)
     pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
     if dr.hint(transport.hide_emitters, mode="scalar"):
         pi = skip_sources(scene, ray, pi, active)
@@ -65,7 +67,8 @@ def split(scene, transport, cache, sampler, ray, active, secondary_samples):
     cube = None
     if dr.hint(transport.far_field is not None, mode="scalar"):
         object_id = transport.object_ids(si)
-        cell, _, found = transport.patches.find_cell(si.p, facing(si, ray), object_id, smooth)
+        mapped = smooth | (hit & transport.far_field.map_mirrors)
+        cell, _, found = transport.patches.find_cell(si.p, facing(si, ray), object_id, mapped)
         cube = transport.far_field.cube(cell, si.p, found)
     vertex = Vertex(si, bsdf, mi.Bool(False), mi.Bool(False), cube)
 

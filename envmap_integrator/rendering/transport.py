@@ -26,6 +26,7 @@ from ..jit import SpareNumbers
 from ..maps.far_field import Cube, FarField
 from ..radiosity.patches import Patches
 from ..radiosity.surface_points import ObjectIds
+from .ray_counts import Ray, count, count_secondary
 
 #: Directions sampled more densely than this [1/sr] belong to a lobe for which a Lambertian
 #: stand-in would misplace the light: they are traced on instead of read from the cache.
@@ -70,6 +71,7 @@ class PathState:
     bounded         whether ``ray.maxt`` ends it at the cube of ``cluster``
     reach           distance [world units] up to which the ray counts the sources that it hits;
                     shadow rays alone count those beyond
+    primary         whether its first ray is what a sensor or a texel sees
     """
 
     ray: mi.Ray3f
@@ -80,6 +82,7 @@ class PathState:
     bounded: mi.Bool
     cluster: mi.UInt32
     reach: mi.Float
+    primary: bool = False
 
 
 @dataclass
@@ -120,6 +123,7 @@ def camera_path(ray: mi.Ray3f) -> PathState:
         bounded=mi.Bool(False),
         cluster=mi.UInt32(0),
         reach=mi.Float(dr.inf),
+        primary=True,
     )
 
 
@@ -159,6 +163,10 @@ def follow(
     valid = active & (scene.environment() is not None and not hide_emitters)
     distance = mi.Float(dr.inf)
     active = mi.Bool(active)
+    if dr.hint(start.primary, mode="scalar"):
+        count(Ray.PRIMARY, ray, active)
+    else:
+        count_secondary(ray, bounded, mi.Bool(False), active)
 
     while dr.hint(active, exclude=[transport, patches, far_field], label="Trace near, look up far"):
         # ---------------------- Trace near ----------------------
@@ -209,8 +217,11 @@ def follow(
         bsdf = si.bsdf(ray)
         smooth = hit & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         normal, object_id = facing(si, ray), transport.object_ids(si)
-        cell, size, found = patches.find_cell(si.p, normal, object_id, smooth)
-        deep = found & (depth >= transport.gather_depth)
+        mapped = smooth
+        if dr.hint(far_field is not None and far_field.map_mirrors, mode="scalar"):
+            mapped = hit
+        cell, size, found = patches.find_cell(si.p, normal, object_id, mapped)
+        deep = found & smooth & (depth >= transport.gather_depth)
         patch, has_patch = patches.find(si.p, normal, object_id, size, deep, spare.next_2d())
         # A coarse mesh can't serve hits about as near as its patches are large (corners,
         # contacts). The threshold is random, so that no border shows.
@@ -275,6 +286,7 @@ def follow(
         roulette = active & (bounces >= RR_DEPTH)
         active &= ~roulette | (sampler.next_1d() < survival)
         throughput[roulette] *= dr.rcp(survival)
+        count_secondary(ray, bounded, retrace, active)
 
     return PathEnd(radiance, direct, weight, row, valid, distance)
 
@@ -318,7 +330,9 @@ class Vertex:
         mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, dr.select(alone, 0, bsdf_pdf)))
         light = bsdf_value * em_weight * mis
         active = active & (ds.pdf != 0) & ~(cached & self.lit) & (dr.max(light) > 0)
-        active &= ~scene.ray_test(self.si.spawn_ray_to(ds.p), active)
+        ray = self.si.spawn_ray_to(ds.p)
+        count(Ray.SHADOW, ray, active)
+        active &= ~scene.ray_test(ray, active)
         return dr.select(active, light, 0)
 
 
@@ -376,6 +390,7 @@ def skip_sources(scene, ray, pi, active):
         si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
         behind = si.spawn_ray(ray.d)
         ray = dr.select(active, behind, ray)
+        count(Ray.PRIMARY, ray, active)
         pi_behind = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
         pi = dr.select(active, pi_behind, pi)
         active &= pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711

@@ -112,13 +112,20 @@ def listed(scene, *requests: ClusterRequest):
 
 
 def test_listed_shapes_make_clusters(scene):
-    both = ClusterRequest("globes", ("left", "right"), None)
+    both = ClusterRequest("globes", ("left", "right"), 1.2)
     (cluster,), cluster_of_point = listed(scene, both)
     points = hall()
     assert cluster.name == "globes"
     assert cluster.centre == pytest.approx((LEFT + RIGHT) / 2, abs=0.05)
-    assert cluster.half_width == pytest.approx(RATIO * cluster.radius)
+    assert cluster.half_width == pytest.approx(1.2 * cluster.radius)
     assert np.array_equal(cluster_of_point, np.where(points.object_id > 0, 0, -1))
+
+
+def test_a_listed_cube_that_holds_the_whole_scene_is_left_out(scene):
+    large, small = ClusterRequest("a", ("left",), 100.0), ClusterRequest("b", ("right",), 1.2)
+    clusters, cluster_of_point = listed(scene, large, small)
+    assert [cluster.name for cluster in clusters] == ["b"]
+    assert np.array_equal(cluster_of_point, np.where(hall().object_id == 2, 0, -1))
 
 
 def test_a_request_may_have_its_own_ratio(scene):
