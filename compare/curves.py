@@ -10,7 +10,6 @@ from scipy import stats
 
 from compare.metrics import Estimate
 
-
 NO_FLOOR = 0.05
 """A floor below this share of the last error is lost in its noise."""
 

@@ -18,8 +18,8 @@ WHITE_PERCENTILE = 97
 ERROR_LIMIT = 0.25
 """Relative error at full saturation: blue is too dark, red too bright."""
 
-PANEL_WIDTH = 4.0
-"""Inches."""
+PANEL_WIDTH = 2.6
+"""Inches; at 100 dots an inch, pictures of the usual width are shown about pixel by pixel."""
 
 COLUMNS = 4
 """Panels in a row."""
@@ -54,16 +54,20 @@ def panels(
     axes = np.ravel(figure.subplots(rows, columns, squeeze=False))
     scale = exposure(reference)
     for axis, (title, picture) in zip(axes, pictures.items(), strict=False):
-        axis.imshow(srgb(picture * scale))
-        axis.set_title(title)
+        axis.imshow(srgb(picture * scale), interpolation="nearest")
+        axis.set_title(title, fontsize="small")
     error_axes = axes[len(pictures) : count]
     for axis, (title, picture) in zip(error_axes, errors.items(), strict=True):
         image = axis.imshow(
-            signed_error(picture, reference), cmap="RdBu_r", vmin=-ERROR_LIMIT, vmax=ERROR_LIMIT
+            signed_error(picture, reference),
+            cmap="RdBu_r",
+            vmin=-ERROR_LIMIT,
+            vmax=ERROR_LIMIT,
+            interpolation="nearest",
         )
-        axis.set_title(title)
+        axis.set_title(title, fontsize="small")
     if errors:
-        figure.colorbar(image, ax=list(error_axes), shrink=0.8, label="relative error")
+        figure.colorbar(image, ax=list(axes), shrink=0.6, label="relative error")
     for axis in axes:
         axis.set_axis_off()
     return figure
@@ -75,12 +79,16 @@ def plot(width: float = 6.0, height: float = 4.5, columns: int = 1) -> tuple[Fig
     return figure, np.ravel(figure.subplots(1, columns, squeeze=False))
 
 
-def png(image: Figure | NDArray[np.uint8], dpi: float = 100) -> bytes:
-    """A figure, or 8-bit sRGB values [H, W, 3], as a PNG file."""
+def png(image: Figure | NDArray[np.uint8]) -> bytes:
+    """A figure, or 8-bit sRGB values [H, W, 3], as a PNG file.
+
+    Figures get a palette of 256 colours: a third of the size, and no difference to the eye.
+    """
     buffer = io.BytesIO()
     if isinstance(image, Figure):
-        image.savefig(buffer, dpi=dpi)
-        buffer.seek(0)
-        image, buffer = np.array(Image.open(buffer).convert("RGB")), io.BytesIO()
-    Image.fromarray(image).save(buffer, format="PNG", optimize=True)
+        drawn = io.BytesIO()
+        image.savefig(drawn, dpi=100)
+        Image.open(drawn).convert("RGB").quantize(256).save(buffer, format="PNG", optimize=True)
+    else:
+        Image.fromarray(image).save(buffer, format="PNG")
     return buffer.getvalue()

@@ -6,6 +6,7 @@ first run of a task does; the time that Dr.Jit spent on it is taken out of that 
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,7 +16,7 @@ import numpy as np
 
 from compare.denoiser import denoise, warm_up
 from compare.metrics import Picture
-from compare.scenes import Subject
+from compare.scenes import PATH, Subject
 from envmap_integrator.cli.timing import compilation_time, measure, record_kernels
 from envmap_integrator.progress import stage
 
@@ -39,7 +40,7 @@ class Run:
     """What one timed run gave; ``_s`` are seconds.
 
     prepare_s       pre-passes, all stages
-    stages_s        each of their stages
+    stages_s        each of their stages, compilation included
     render_s        the picture itself
     denoise_s       guide images and denoiser, 0 without
     compile_s       compilation of kernels, which the other times leave out
@@ -138,6 +139,19 @@ def interleave(
                 measurements.runs.append(_timed_run(task, integrator, preparation, seed + index))
                 advance(1)
     return measured
+
+
+def equal_time_spp(task: Task, pilot_spp: int, seed: int, hide_emitters: bool = False) -> int:
+    """Samples per pixel of ``path`` that fit into the time of a task, by two pilot runs.
+
+    ``pilot_spp`` are those of the pilot of ``path``. Samplers that stratify round up to full grids,
+    so the number is one of a nearly square grid.
+    """
+    pilots = [task, Task(task.scene, PATH, pilot_spp)]
+    ours, path = interleave(pilots, 2, seed, hide_emitters)
+    spp = max(round(pilot_spp * ours.runs[1].total_s / path.runs[1].total_s), 1)
+    rows = math.isqrt(spp)
+    return rows * round(spp / rows)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,13 @@ BEST_SAMPLER = "multijitter"
 """Of Mitsuba's samplers, the one with which ``path`` has the least error (see README.md)."""
 
 
+PAPER_TABLE = ("table-top", *(f"table-leg-{i}" for i in range(1, 5)), "ball")
+"""Ids of all that the paper has inside its cube."""
+
+PAPER_CLUSTER = {"type": "mipmap_cube", "shapes": ", ".join(PAPER_TABLE)}
+"""The paper's only cluster; ids need a view that doesn't merge meshes."""
+
+
 @dataclass(frozen=True)
 class View:
     """A scene as all integrators see it: the same film, box filter and sampler for each.

@@ -22,7 +22,16 @@ from compare.options import existing, option
 from compare.references import Reference, reference
 from compare.report import Illustration, Report, Slider, Table
 from compare.runs import Measurements, Task, interleave
-from compare.scenes import HYBRID, ONE_LEVEL_PATH, OWN_SCENES, PATH, SOURCE_SELECTION, Subject, View
+from compare.scenes import (
+    BEST_SAMPLER,
+    HYBRID,
+    ONE_LEVEL_PATH,
+    OWN_SCENES,
+    PATH,
+    SOURCE_SELECTION,
+    Subject,
+    View,
+)
 
 SCENES = tuple(
     OWN_SCENES / f"{name}.xml" for name in ("paper_room", "desk", "door_ajar", "atrium", "open")
@@ -30,6 +39,9 @@ SCENES = tuple(
 SUBJECTS = {s.integrator: s for s in (PATH, HYBRID, ONE_LEVEL_PATH, SOURCE_SELECTION)}
 TARGETS = (1e-2, 1e-3)
 """relMSE at which speed-ups are read off, besides twice the floor of each subject."""
+
+PILOT_SPP = 16
+"""At most so many samples per pixel tell how long a picture will take."""
 
 PICTURE_SPP = 16
 """Samples per pixel of the pictures that are shown, or the next fewer."""
@@ -44,7 +56,8 @@ class Options(CommonOptions):
     )
     integrators: tuple[str, ...] = option("plugins to compare; path takes part", tuple(SUBJECTS))
     denoised: tuple[str, ...] = option("plugins to denoise too", ("path", "envmap_hybrid"))
-    sampler: str = option("plugin that draws all sample points", "multijitter")
+    sampler: str = option("plugin that draws all sample points", BEST_SAMPLER)
+    max_seconds: float = option("sample counts whose picture takes longer are left out", 60.0)
 
 
 def run(options: Options, folder: Path, scenes: tuple[Path, ...] = SCENES) -> Iterator[Report]:
@@ -67,15 +80,24 @@ def _subjects(options: Options) -> list[Subject]:
 
 def compare(view: View, subjects: list[Subject], options: Options, judged_by: Reference) -> Report:
     """All curves of one scene; the first subject is what the others are measured against."""
-    scene = view.load()
+    scene, hidden = view.load(), view.hides_emitters()
     tasks = [
         Task(scene, subject, spp, denoise=subject.integrator in options.denoised)
         for subject in subjects
-        for spp in sorted(options.spp)
+        for spp in _affordable(scene, subject, options, hidden)
     ]
-    measured = interleave(tasks, options.runs, options.seed, view.hides_emitters())
+    measured = interleave(tasks, options.runs, options.seed, hidden)
     curves = [curve for s in subjects for curve in _curves(s, measured, judged_by)]
     return _report(view, options, measured, curves, judged_by)
+
+
+def _affordable(scene: mi.Scene, subject: Subject, options: Options, hidden: bool) -> list[int]:
+    """Sample counts whose pictures take no longer than allowed, judged by a pilot; at least two."""
+    ladder = sorted(options.spp)
+    pilot = max([spp for spp in ladder if spp <= PILOT_SPP], default=ladder[0])
+    (measured,) = interleave([Task(scene, subject, pilot)], 1, options.seed, hidden)
+    limit = options.max_seconds * pilot / measured.median("render_s")
+    return [spp for index, spp in enumerate(ladder) if index < 2 or spp <= limit]
 
 
 def _curves(
@@ -136,8 +158,7 @@ def _report(
             "overtaking": {c.name: overtaking_time(first, c) for c in curves[1:]},
             "bias_of_mean": {
                 one.subject.name: mean_bias(one.pictures(), judged_by.part_means)
-                for one in measured
-                if one.spp == max(options.spp)
+                for one in _finest(measured)
             },
             "reference": judged_by.numbers(),
         },
@@ -248,13 +269,17 @@ def _plot(curves: list[Curve]):
 
 def _pictures(measured: list[Measurements], judged_by: Reference):
     shown = _shown(measured)
-    last = [one for one in measured if one.spp == max(m.spp for m in measured)]
     errors = {
         f"{one.subject.name}, mean error": np.mean(one.pictures(), axis=0, dtype=np.float64)
-        for one in last
+        for one in _finest(measured)
     }
     pictures = {f"{one.subject.name}, {one.spp} spp": one.runs[0].picture for one in shown}
     return panels(pictures, judged_by.picture, errors, columns=max(len(shown), 2))
+
+
+def _finest(measured: list[Measurements]) -> list[Measurements]:
+    """Of each subject, what has the most samples: they are in ascending order."""
+    return list({one.subject.name: one for one in measured}.values())
 
 
 def _shown(measured: list[Measurements]) -> list[Measurements]:

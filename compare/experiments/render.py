@@ -17,7 +17,7 @@ from compare.options import Options as CommonOptions
 from compare.options import existing, option
 from compare.references import Reference, reference
 from compare.report import Illustration, Report, Slider, Table
-from compare.runs import Measurements, Task, interleave
+from compare.runs import Measurements, Task, equal_time_spp, interleave
 from compare.scenes import PAPER_ROOM, PATH, Subject, View
 
 SCENES = (PAPER_ROOM,)
@@ -47,19 +47,13 @@ def _compare(view: View, options: Options, folder: Path) -> Report:
     scene, hidden = view.load(), view.hides_emitters()
     subjects = [Subject(name) for name in dict.fromkeys(options.integrators) if name != "path"]
     tasks = [Task(scene, subject, options.spp) for subject in subjects]
-    tasks.append(Task(scene, PATH, _path_spp(tasks, options, hidden)))
+    spp = options.spp
+    if options.equal == "time" and tasks:
+        spp = equal_time_spp(tasks[0], spp, options.seed, hidden)
+    tasks.append(Task(scene, PATH, spp))
     measured = interleave(tasks, options.runs, options.seed, hidden)
     judged_by = reference(view, options.reference_spp, folder / "references")
     return _report(view, options, measured, judged_by)
-
-
-def _path_spp(tasks: list[Task], options: Options, hidden: bool) -> int:
-    """As many samples as fit into the time of the first task, if time is to be equal."""
-    if options.equal == "spp" or not tasks:
-        return options.spp
-    pilots = [tasks[0], Task(tasks[0].scene, PATH, options.spp)]
-    ours, path = interleave(pilots, 2, options.seed, hidden)
-    return max(round(options.spp * ours.runs[1].total_s / path.runs[1].total_s), 1)
 
 
 def _report(

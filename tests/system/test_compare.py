@@ -1,0 +1,212 @@
+"""The experiments at tiny size, and the harness on answers that are known."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from compare import report
+from compare.__main__ import EXPERIMENTS, main
+from compare.experiments import error_vs_time
+from compare.references import reference
+from compare.runs import Task, interleave
+from compare.scenes import HYBRID, PAPER_ROOM, PATH, Subject, View
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+#: Smaller than ``--quick``, for each experiment.
+COMMON = {"width": 32, "runs": 3, "reference_spp": 16}
+TINY = {
+    "resolution": {"spp": 4, "resolutions": (8, 16), "patches": 256},
+    "distance": {"spp": 4, "resolution": 16, "ratios": (1.25, 2.0), "patches": 256},
+    "algorithms": {
+        "spp": 1,
+        "secondary_samples": 4,
+        "shadow_samples": 2,
+        "default_spp": 4,
+        "patches": 256,
+    },
+    "error-vs-time": {"spp": (1, 4)},
+    "complexity": {"spp": 2, "triangles": (2000, 4000), "resolutions": (8, 16)},
+    "render": {"spp": 4},
+}
+
+
+@pytest.fixture(scope="module")
+def references(tmp_path_factory):
+    """Folder that the references of this module share."""
+    return tmp_path_factory.mktemp("references")
+
+
+# ---------------------- All experiments ----------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_experiment(name, tmp_path):
+    """Each writes what was asked, with all its numbers, and shows them."""
+    module = EXPERIMENTS[name]
+    outcomes = list(module.run(module.Options(**COMMON, **TINY[name]), tmp_path, **_scenes(module)))
+    for outcome in outcomes:
+        report.show(outcome)
+        report.write(outcome, tmp_path)
+        check_files(outcome, tmp_path)
+    assert outcomes and any(outcome.figures for outcome in outcomes)
+
+
+def _scenes(module):
+    return {"scenes": (PAPER_ROOM,)} if hasattr(module, "SCENES") else {}
+
+
+def check_files(outcome, folder):
+    document = json.loads((folder / f"{outcome.name}.json").read_text(), parse_constant=pytest.fail)
+    assert document["schema"] == report.SCHEMA
+    assert document["experiment"] == outcome.name
+    assert {"title", "settings", "numbers", "findings", "versions", "machine"} <= document.keys()
+    assert document["settings"]["seed"] == 0 and document["settings"]["width"] == COMMON["width"]
+    assert document["versions"].keys() >= {"envmap_integrator", "mitsuba", "drjit", "llvm"}
+    assert document["numbers"] and outcome.tables
+    for table in outcome.tables:
+        assert table.rows and all(len(row) == len(table.columns) for row in table.rows)
+    for run in _runs(document["numbers"]):
+        assert {"seed", "prepare_s", "stages_s", "render_s", "compile_s"} <= run.keys()
+    for illustration in outcome.figures:
+        assert (folder / f"{outcome.name}-{illustration.name}.png").stat().st_size > 1000
+    page = (folder / f"{outcome.name}.html").read_text()
+    assert page.count("<img") == page.count('src="data:image/png;base64,')  # readable offline
+    assert "http" not in page
+
+
+def _runs(value):
+    """All records of runs anywhere in a JSON document."""
+    if isinstance(value, dict):
+        if "render_s" in value and "seed" in value:
+            yield value
+        value = list(value.values())
+    if isinstance(value, list):
+        for item in value:
+            yield from _runs(item)
+
+
+# ---------------------- Known answers ----------------------
+
+
+def known(spp, runs, **changes):
+    return error_vs_time.Options(
+        width=96, runs=runs, reference_spp=256, spp=spp, sampler="independent", **changes
+    )
+
+
+@pytest.mark.slow
+def test_path_against_itself_is_as_fast(references):
+    """Speed-up 1 ± 10 %."""
+    options = known((16, 64), runs=9, denoised=())
+    view = View(PAPER_ROOM, options.width, sampler=options.sampler)
+    judged_by = reference(view, options.reference_spp, references)
+    outcome = error_vs_time.compare(view, [PATH, replace(PATH, label="again")], options, judged_by)
+    first, again = outcome.numbers["curves"]
+    np.testing.assert_array_equal(first["errors"], again["errors"])
+    speed_up = outcome.numbers["speed_ups"]["again"]["its last error"]
+    assert speed_up.value == pytest.approx(1, abs=0.1)
+
+
+@pytest.mark.slow
+def test_path_with_twice_the_samples_has_half_the_variance(references):
+    options = known((16, 32), runs=5, denoised=())
+    # Without the mirror, whose fireflies make errors of few seeds differ by more than that.
+    diffuse = {"table": "table-diffuse"}
+    view = View(PAPER_ROOM, options.width, diffuse, sampler=options.sampler)
+    judged_by = reference(view, options.reference_spp, references)
+    outcome = error_vs_time.compare(view, [PATH], options, judged_by)
+    few, many = np.mean(outcome.numbers["curves"][0]["errors"], axis=1)
+    assert few / many == pytest.approx(2, rel=0.1)
+
+
+# ---------------------- References ----------------------
+
+
+def test_references_are_rendered_once(references):
+    view = View(PAPER_ROOM, 16)
+    first = reference(view, 4, references)
+    stored = sorted(references.glob("paper_room-*.exr"))
+    again = reference(view, 4, references)
+    np.testing.assert_array_equal(first.half_a, again.half_a)
+    assert sorted(references.glob("paper_room-*.exr")) == stored
+    assert first.part_means == again.part_means
+
+
+def test_halves_of_a_reference_are_independent(references):
+    judged_by = reference(View(PAPER_ROOM, 16), 4, references)
+    assert not np.array_equal(judged_by.half_a, judged_by.half_b)
+    assert judged_by.rel_mse > 0
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"width": 17}, {"sampler": "independent"}, {"parameters": {"table": "table-specular"}}],
+)
+def test_other_content_is_another_reference(change):
+    view = View(PAPER_ROOM, 16)
+    assert replace(view, **change).content_hash() != view.content_hash()
+
+
+def test_changed_mesh_is_another_reference(tmp_path):
+    (tmp_path / "scene.xml").write_text(
+        '<scene version="3.0.0"><shape type="ply">'
+        '<string name="filename" value="mesh.ply"/></shape></scene>'
+    )
+    view = View(tmp_path / "scene.xml", 16)
+    hashes = []
+    for content in ("one", "two"):
+        (tmp_path / "mesh.ply").write_text(content)
+        hashes.append(view.content_hash())
+    assert hashes[0] != hashes[1]
+
+
+# ---------------------- Runs ----------------------
+
+
+def test_samples_share_a_preparation_and_runs_do_not():
+    scene = View(PAPER_ROOM, 16).load()
+    small = replace(HYBRID, settings={"patches": 512, "map_resolution": 8})
+    measured = interleave([Task(scene, small, 1), Task(scene, small, 2)], 3, seed=5)
+    one, two = (measurements.runs for measurements in measured)
+    assert [run.seed for run in one] == [5, 6, 7]
+    assert [run.prepare_s for run in one] == [run.prepare_s for run in two]
+    assert len({run.prepare_s for run in one}) == 3
+    assert set(one[0].stages_s) == {"coarse mesh", "irradiance cache", "clusters", "maps"}
+
+
+def test_compilation_is_apart():
+    """A kernel that is new has its compilation in the first run, and not in its time."""
+    scene = View(PAPER_ROOM, 19).load()
+    (measurements,) = interleave([Task(scene, PATH, 3)], 3, seed=0)
+    assert measurements.runs[1].compile_s == measurements.runs[2].compile_s == 0
+    assert measurements.runs[0].render_s < 20 * measurements.median("render_s")
+
+
+# ---------------------- Command line ----------------------
+
+
+def test_unknown_scene(capsys):
+    assert main(["render", "none.xml", "--quick"]) == 2
+    assert 'compare: scene "none.xml" does not exist' in capsys.readouterr().err
+
+
+def test_too_few_runs(capsys):
+    assert main(["render", "--runs", "2"]) == 2
+    assert "--runs must be at least 3" in capsys.readouterr().err
+
+
+def test_unknown_plugin(capsys, tmp_path):
+    assert main(["render", "--quick", "--integrators", "none", "--out", str(tmp_path)]) == 2
+    assert "none" in capsys.readouterr().err
+
+
+def test_settings_reach_the_integrator():
+    subject = Subject("one_level_path", {"shadow_samples": 3}, label="three")
+    assert subject.name == "three"
+    assert "shadow_samples = 3" in str(subject.make())
