@@ -53,8 +53,9 @@ def _add_experiment(subparsers: argparse._SubParsersAction, name: str, module: M
     parser = subparsers.add_parser(name, help=summary, description=module.__doc__)
     if hasattr(module, "SCENES"):
         parser.add_argument(
-            "scenes", nargs="*", type=Path, default=module.SCENES, metavar="SCENE.xml"
-        )
+            "scenes", nargs="*", type=Path, metavar="SCENE.xml",
+            help="default: " + ", ".join(path.name for path in module.SCENES),
+        )  # fmt: skip
     add_options(parser, module.Options)
     parser.add_argument("--quick", action="store_true", help="a look in minutes: less of it all")
     parser.add_argument("--out", type=Path, default=Path("renders"), help="folder of the results")
@@ -66,15 +67,19 @@ def _run(module: ModuleType, args: argparse.Namespace) -> None:
     options = read_options(args, module.Options)
     activate_variant(args.mode)
     start = time.perf_counter()
-    for outcome in module.run(options, args.out, **_scenes(args)):
+    for outcome in module.run(options, args.out, **_scenes(module, args)):
         report.show(outcome)
         report.write(outcome, args.out)
         print(f"wrote {args.out / outcome.name}.html, .json, *.png, *.exr")
     print(f"{args.experiment} took {time.perf_counter() - start:.0f} s")
 
 
-def _scenes(args: argparse.Namespace) -> dict[str, tuple[Path, ...]]:
-    return {"scenes": tuple(args.scenes)} if hasattr(args, "scenes") else {}
+def _scenes(module: ModuleType, args: argparse.Namespace) -> dict[str, tuple[Path, ...]]:
+    """The scenes that were named, else the experiment's own, or two of them for a quick look."""
+    if not hasattr(module, "SCENES"):
+        return {}
+    own = module.SCENES[:2] if args.quick else module.SCENES
+    return {"scenes": tuple(args.scenes) or own}
 
 
 if __name__ == "__main__":

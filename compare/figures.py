@@ -21,6 +21,9 @@ ERROR_LIMIT = 0.25
 PANEL_WIDTH = 2.6
 """Inches; at 100 dots an inch, pictures of the usual width are shown about pixel by pixel."""
 
+PLOT_WIDTH, PLOT_HEIGHT = 6.0, 4.5
+"""Of the axes of a plot [inches]."""
+
 COLUMNS = 4
 """Panels in a row."""
 
@@ -73,10 +76,10 @@ def panels(
     return figure
 
 
-def plot(width: float = 6.0, height: float = 4.5, columns: int = 1) -> tuple[Figure, NDArray]:
-    """A figure with a row of empty axes."""
-    figure = Figure(figsize=(width * columns, height), layout="constrained")
-    return figure, np.ravel(figure.subplots(1, columns, squeeze=False))
+def plot(columns: int = 1, rows: int = 1) -> tuple[Figure, NDArray]:
+    """A figure with empty axes, row by row."""
+    figure = Figure(figsize=(PLOT_WIDTH * columns, PLOT_HEIGHT * rows), layout="constrained")
+    return figure, np.ravel(figure.subplots(rows, columns, squeeze=False))
 
 
 def png(image: Figure | NDArray[np.uint8]) -> bytes:

@@ -13,6 +13,8 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from compare.curves import Curve, overtaking_time, speed_up
 from compare.figures import panels, plot
@@ -45,6 +47,15 @@ PILOT_SPP = 16
 
 PICTURE_SPP = 16
 """Samples per pixel of the pictures that are shown, or the next fewer."""
+
+
+COLUMNS = 3
+"""Panels in a row of the summary's plot."""
+
+CAPTION = (
+    "relMSE against wall time: medians of the times and means of the errors of all seeds, bars "
+    "from the least to the greatest; dashed: preparation not counted. Compilation is not counted."
+)
 
 
 @dataclass(frozen=True)
@@ -166,13 +177,7 @@ def _report(
     report.tables = [_speed_up_table(report, curves), _time_table(measured)]
     report.findings = _findings(report, curves)
     report.figures = [
-        Illustration(
-            "curves",
-            "relMSE against wall time: medians of the times and means of the errors of all seeds, "
-            "bars from the least to the greatest; dashed: preparation not counted. Compilation is "
-            "not counted.",
-            _plot(curves),
-        ),
+        Illustration("curves", CAPTION, _plot({view.name: curves})),
         Illustration(
             "pictures", "One run of each, and mean errors.", _pictures(measured, judged_by)
         ),
@@ -248,23 +253,31 @@ def _findings(report: Report, curves: list[Curve]) -> list[str]:
     return findings
 
 
-def _plot(curves: list[Curve]):
-    figure, (axis,) = plot()
-    for index, curve in enumerate(curves):
-        time, error = np.median(curve.seconds, axis=1), curve.errors.mean(axis=1)
-        spread = np.abs(np.stack([curve.seconds.min(axis=1), curve.seconds.max(axis=1)]) - time)
-        errors = np.abs(np.stack([curve.errors.min(axis=1), curve.errors.max(axis=1)]) - error)
-        color, marker = f"C{index}", "ox^sDv*P"[index % 8]
-        axis.errorbar(
-            time, error, errors, spread, color=color, marker=marker, ms=4, label=curve.name
-        )
-        if curve.prepare_s.any():
-            apart = np.median(curve.seconds - curve.prepare_s, axis=1)
-            axis.plot(apart, error, "--", color=color, alpha=0.5)
-    axis.set(xscale="log", yscale="log", xlabel="wall time [s]", ylabel="relMSE")
-    axis.grid(alpha=0.3, which="both")
-    axis.legend()
+def _plot(scenes: dict[str, list[Curve]]) -> Figure:
+    """One panel a scene."""
+    columns = min(len(scenes), COLUMNS)
+    figure, axes = plot(columns=columns, rows=-(-len(scenes) // columns))
+    for axis in axes[len(scenes) :]:
+        axis.set_axis_off()
+    for axis, (name, curves) in zip(axes, scenes.items(), strict=False):
+        for index, curve in enumerate(curves):
+            _draw(axis, curve, f"C{index}", "ox^sDv*P"[index % 8])
+        axis.set(title=name, xscale="log", yscale="log", xlabel="wall time [s]", ylabel="relMSE")
+        axis.grid(alpha=0.3, which="both")
+    axes[0].legend(fontsize="small")
     return figure
+
+
+def _draw(axis: Axes, curve: Curve, color: str, marker: str) -> None:
+    time, error = np.median(curve.seconds, axis=1), curve.errors.mean(axis=1)
+    spreads = [
+        np.abs(np.stack([values.min(axis=1), values.max(axis=1)]) - middle)
+        for values, middle in ((curve.errors, error), (curve.seconds, time))
+    ]
+    axis.errorbar(time, error, *spreads, color=color, marker=marker, ms=4, label=curve.name)
+    if curve.prepare_s.any():
+        apart = np.median(curve.seconds - curve.prepare_s, axis=1)
+        axis.plot(apart, error, "--", color=color, alpha=0.5)
 
 
 def _pictures(measured: list[Measurements], judged_by: Reference):
@@ -307,32 +320,53 @@ def _add_slider(report: Report, measured: list[Measurements], judged_by: Referen
 def _summary(reports: list[Report], options: Options) -> Report:
     """Speed-ups of all scenes; geometric means over those that reach the error."""
     names = list(reports[0].numbers["speed_ups"])
-    columns = [(name, f"{target:.0e}") for target in TARGETS for name in names]
-    rows, means = [], {}
-    for report in reports:
-        ups = [report.numbers["speed_ups"][name][target] for name, target in columns]
-        rows.append([report.name.removeprefix("error-vs-time-"), *map(_text, ups)])
-    mean_row = ["geometric mean"]
-    for name, target in columns:
-        values = [r.numbers["speed_ups"][name][target] for r in reports]
-        reached = [up.value for up in values if up is not None]
-        mean = float(np.exp(np.mean(np.log(reached)))) if reached else None
-        means[f"{name} at {target}"] = {"mean": mean, "scenes": len(reached)}
-        mean_row.append(f"{mean:.2f} ({len(reached)})" if reached else "–")
+    curves = {
+        report.name.removeprefix("error-vs-time-"): [
+            Curve(**numbers) for numbers in report.numbers["curves"]
+        ]
+        for report in reports
+    }
+    tables, means = [], {}
+    for target in (f"{target:.0e}" for target in TARGETS):
+        means[target] = {name: _geometric_mean(reports, name, target) for name in names}
+        tables.append(_summary_table(reports, names, target, means[target], options))
     return Report(
         name="error-vs-time",
         title=f"Speed-up over path at equal error, {len(reports)} scenes",
         settings={**asdict(options), "variant": mi.variant()},
-        tables=[
-            Table(
-                f"Speed-up over path at equal error, preparation included; {options.width} wide",
-                ["scene", *(f"{name} at {target}" for name, target in columns)],
-                [*rows, mean_row],
-                "In brackets: scenes that reach the error and make up the mean.",
-            )
-        ],
+        tables=tables,
+        figures=[Illustration("curves", CAPTION, _plot(curves))],
         numbers={
             "speed_ups": {r.name: r.numbers["speed_ups"] for r in reports},
             "geometric_means": means,
         },
+    )
+
+
+def _geometric_mean(reports: list[Report], name: str, target: str) -> dict[str, object]:
+    ups = [report.numbers["speed_ups"][name][target] for report in reports]
+    reached = [up.value for up in ups if up is not None]
+    mean = float(np.exp(np.mean(np.log(reached)))) if reached else None
+    return {"mean": mean, "scenes": len(reached)}
+
+
+def _summary_table(
+    reports: list[Report], names: list[str], target: str, means: dict, options: Options
+) -> Table:
+    rows = [
+        [report.name.removeprefix("error-vs-time-")]
+        + [_text(report.numbers["speed_ups"][name][target]) for name in names]
+        for report in reports
+    ]
+    mean_row = [
+        "–"
+        if means[name]["mean"] is None
+        else f"{means[name]['mean']:.2f} of {means[name]['scenes']}"
+        for name in names
+    ]
+    return Table(
+        f"Speed-up over path at relMSE {target}, preparation included; {options.width} wide",
+        ["scene", *names],
+        [*rows, ["geometric mean", *mean_row]],
+        "The mean is of those scenes that reach the error.",
     )
