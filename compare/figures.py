@@ -52,7 +52,7 @@ def panels(
     columns = min(columns, count)
     rows = -(-count // columns)
     height, width = reference.shape[:2]
-    row_height = PANEL_WIDTH * height / width + 0.35
+    row_height = PANEL_WIDTH * height / width + 0.3
     figure = Figure(figsize=(PANEL_WIDTH * columns, row_height * rows), layout="constrained")
     axes = np.ravel(figure.subplots(rows, columns, squeeze=False))
     scale = exposure(reference)
@@ -70,7 +70,7 @@ def panels(
         )
         axis.set_title(title, fontsize="small")
     if errors:
-        figure.colorbar(image, ax=list(axes), shrink=0.6, label="relative error")
+        figure.colorbar(image, ax=list(axes), shrink=0.6, aspect=40, label="relative error")
     for axis in axes:
         axis.set_axis_off()
     return figure
@@ -83,15 +83,11 @@ def plot(columns: int = 1, rows: int = 1) -> tuple[Figure, NDArray]:
 
 
 def png(image: Figure | NDArray[np.uint8]) -> bytes:
-    """A figure, or 8-bit sRGB values [H, W, 3], as a PNG file.
-
-    Figures get a palette of 256 colours: a third of the size, and no difference to the eye.
-    """
+    """A figure, or 8-bit sRGB values [H, W, 3], as a PNG file."""
     buffer = io.BytesIO()
     if isinstance(image, Figure):
-        drawn = io.BytesIO()
-        image.savefig(drawn, dpi=100)
-        Image.open(drawn).convert("RGB").quantize(256).save(buffer, format="PNG", optimize=True)
-    else:
-        Image.fromarray(image).save(buffer, format="PNG")
+        image.savefig(buffer, dpi=100)
+        image = np.array(Image.open(buffer).convert("RGB"))
+        buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, format="PNG", optimize=True)
     return buffer.getvalue()

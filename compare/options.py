@@ -19,12 +19,18 @@ class Options:
 
     width: int = option("of the film, in pixels; its shape is the scene's own", 320, 96)
     runs: int = option("interleaved runs, each with a seed of its own; at least 3", 5, 3)
-    reference_spp: int = option("samples per pixel of each half of the reference", 1024, 256)
     seed: int = option("seed of the first run", 0)
 
     def __post_init__(self):
         if self.runs < 3:
             raise ValueError(f"--runs must be at least 3 for a median, got {self.runs}")
+
+
+@dataclass(frozen=True)
+class JudgedOptions(Options):
+    """What experiments are told that compare pictures with a reference."""
+
+    reference_spp: int = option("samples per pixel of each half of the reference", 1024, 256)
 
 
 def add_options(parser: argparse.ArgumentParser, kind: type[Options]) -> None:

@@ -17,8 +17,7 @@ import numpy as np
 
 from compare.figures import panels
 from compare.metrics import Estimate, error_floor, estimate, rel_mse
-from compare.options import Options as CommonOptions
-from compare.options import option
+from compare.options import JudgedOptions, option
 from compare.references import Reference
 from compare.regions import Mask, crop, first_hits, within
 from compare.report import Illustration, Table
@@ -35,7 +34,7 @@ LOOKUPS = ("plain", "corrected")
 
 
 @dataclass(frozen=True)
-class Options(CommonOptions):
+class Options(JudgedOptions):
     """What both experiments are told."""
 
     spp: int = option("samples per pixel", 64, 16)

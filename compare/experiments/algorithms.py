@@ -16,8 +16,7 @@ import numpy as np
 
 from compare.figures import panels
 from compare.metrics import Picture, error_floor, estimate, mean_bias, rel_mse, signed_error, tiles
-from compare.options import Options as CommonOptions
-from compare.options import option
+from compare.options import JudgedOptions, option
 from compare.references import Reference, reference
 from compare.report import Illustration, Report, Slider, Table
 from compare.runs import Measurements, Task, equal_time_spp, interleave, render
@@ -73,7 +72,7 @@ PRINTED_MAP_RAYS = (1, 16, 1)
 
 
 @dataclass(frozen=True)
-class Options(CommonOptions):
+class Options(JudgedOptions):
     """See ``--help``."""
 
     spp: int = option("samples per pixel with the paper's numbers of rays (paper: 1)", 4, 1)

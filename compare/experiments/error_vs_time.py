@@ -19,8 +19,7 @@ from matplotlib.figure import Figure
 from compare.curves import Curve, overtaking_time, speed_up
 from compare.figures import panels, plot
 from compare.metrics import error_floor, mean_bias, rel_mse
-from compare.options import Options as CommonOptions
-from compare.options import existing, option
+from compare.options import JudgedOptions, existing, option
 from compare.references import Reference, reference
 from compare.report import Illustration, Report, Slider, Table
 from compare.runs import Measurements, Task, interleave
@@ -59,7 +58,7 @@ CAPTION = (
 
 
 @dataclass(frozen=True)
-class Options(CommonOptions):
+class Options(JudgedOptions):
     """See ``--help``."""
 
     spp: tuple[int, ...] = option(

@@ -13,8 +13,7 @@ import numpy as np
 
 from compare.figures import panels
 from compare.metrics import error_floor, estimate, mean_bias, rel_mse
-from compare.options import Options as CommonOptions
-from compare.options import existing, option
+from compare.options import JudgedOptions, existing, option
 from compare.references import Reference, reference
 from compare.report import Illustration, Report, Slider, Table
 from compare.runs import Measurements, Task, equal_time_spp, interleave
@@ -24,7 +23,7 @@ SCENES = (PAPER_ROOM,)
 
 
 @dataclass(frozen=True)
-class Options(CommonOptions):
+class Options(JudgedOptions):
     """See ``--help``."""
 
     spp: int = option("samples per pixel", 64, 16)

@@ -21,13 +21,18 @@ class CachedIntegrator(mi.SamplingIntegrator):
     (``transport``).
     """
 
+    PATCH_SAMPLES = 32
+    """By default; the noise of many patches averages out where secondary rays end in them."""
+
     def __init__(self, props: mi.Properties):
         check_variant(props.plugin_name())
         super().__init__(props)
         parameters = Parameters(props)
         self.owner = parameters.owner
         self.patches = parameters.integer("patches", 16384, 16, 1 << 22)
-        self.patch_samples = parameters.power_of_two("patch_samples", 32, 1, 1 << 16)
+        self.patch_samples = parameters.power_of_two(
+            "patch_samples", self.PATCH_SAMPLES, 1, 1 << 16
+        )
         self.shadow_samples = parameters.integer("shadow_samples", 1, 1, 1 << 16)
         self.secondary_samples = 1
         self.cache_file = parameters.text("cache_file")

@@ -20,7 +20,7 @@ class SourceSelection(CachedIntegrator):
        - Budget of patches of the coarse mesh, 16 … 4194304. (Default: 16384)
      * - patch_samples
        - |int|
-       - Gather rays and shadow rays per patch, a power of two. (Default: 32)
+       - Gather rays and shadow rays per patch, a power of two. (Default: 128)
      * - shadow_samples
        - |int|
        - Shadow rays at a camera hit. (Default: 1)
@@ -31,6 +31,9 @@ class SourceSelection(CachedIntegrator):
        - |bool|
        - Hide directly visible emitters. (Default: false)
     """
+
+    PATCH_SAMPLES = 128
+    """The cache is looked at directly, and its noise with it."""
 
     def transport(self, scene, prepared, spp):
         return Transport(

@@ -129,6 +129,27 @@ def test_films_can_be_resized(scene):
     assert tuple(film.crop_size()) == (6, 5)
     assert film.rfilter().radius() == 0.5
     assert first.integrator() is not second.integrator()
+    assert scene_file.film_size == (6, 5)
+
+
+def test_samplers_can_be_replaced(scene):
+    mi.set_variant("llvm_ad_rgb")
+    scene_file = SceneFile(scene)
+    before = scene_file.load().sensors()[0].sampler().sample_count()
+    scene_file.configure_samplers("ldsampler")
+    sampler = scene_file.load().sensors()[0].sampler()
+    assert sampler.class_name() == "LowDiscrepancySampler"
+    assert sampler.sample_count() == before
+
+
+def test_parameters_of_the_integrator_can_be_kept_or_dropped(tmp_path):
+    mi.set_variant("llvm_ad_rgb")
+    deep = '<integrator type="path"><integer name="max_depth" value="7"/></integrator>'
+    scene_file = SceneFile(write_scene(tmp_path, deep))
+    scene_file.configure_integrator("path", {"rr_depth": 9})
+    assert "max_depth" in scene_file.integrator
+    scene_file.configure_integrator("path", keep=False)
+    assert "max_depth" not in scene_file.integrator and "rr_depth" not in scene_file.integrator
 
 
 @pytest.fixture

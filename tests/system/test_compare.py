@@ -11,6 +11,7 @@ import pytest
 from compare import report
 from compare.__main__ import EXPERIMENTS, main
 from compare.experiments import error_vs_time
+from compare.options import JudgedOptions
 from compare.references import reference
 from compare.runs import Task, interleave
 from compare.scenes import HYBRID, PAPER_ROOM, PATH, Subject, View
@@ -18,7 +19,7 @@ from compare.scenes import HYBRID, PAPER_ROOM, PATH, Subject, View
 pytestmark = pytest.mark.usefixtures("variant")
 
 #: Smaller than ``--quick``, for each experiment.
-COMMON = {"width": 32, "runs": 3, "reference_spp": 16}
+COMMON = {"width": 32, "runs": 3}
 TINY = {
     "resolution": {"spp": 4, "resolutions": (8, 16), "patches": 256},
     "distance": {"spp": 4, "resolution": 16, "ratios": (1.25, 2.0), "patches": 256},
@@ -30,7 +31,13 @@ TINY = {
         "patches": 256,
     },
     "error-vs-time": {"spp": (1, 4)},
-    "complexity": {"spp": 2, "triangles": (2000, 4000), "resolutions": (8, 16)},
+    "complexity": {
+        "spp": 4,
+        "patches": 256,
+        "triangles": (10_000, 20_000),
+        "clusters": (0, 1),
+        "resolutions": (8, 16),
+    },
     "render": {"spp": 4},
 }
 
@@ -49,7 +56,10 @@ def references(tmp_path_factory):
 def test_experiment(name, tmp_path):
     """Each writes what was asked, with all its numbers, and shows them."""
     module = EXPERIMENTS[name]
-    outcomes = list(module.run(module.Options(**COMMON, **TINY[name]), tmp_path, **_scenes(module)))
+    options = module.Options(**COMMON, **TINY[name])
+    if isinstance(options, JudgedOptions):
+        options = replace(options, reference_spp=16)
+    outcomes = list(module.run(options, tmp_path, **_scenes(module)))
     for outcome in outcomes:
         report.show(outcome)
         report.write(outcome, tmp_path)
