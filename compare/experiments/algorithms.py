@@ -80,6 +80,7 @@ class Options(JudgedOptions):
     secondary_samples: int = option("secondary rays at a camera hit, there (paper: 100)", 100)
     default_spp: int = option("samples per pixel with our defaults, one ray of each kind", 64, 16)
     patches: int = option("budget of patches of the coarse mesh", 16384, 2048)
+    patch_samples: int = option("gather rays per patch, a power of two", 128, 32)
 
 
 @dataclass(frozen=True)
@@ -135,7 +136,7 @@ def run(options: Options, folder: Path) -> Iterator[Report]:
 
 def _paper_subjects(options: Options) -> list[Subject]:
     """The paper's algorithms with its numbers of rays; look-ups are ours."""
-    shadow = {"patches": options.patches, "shadow_samples": options.shadow_samples}
+    shadow = _cache(options) | {"shadow_samples": options.shadow_samples}
     both: dict[str, Any] = shadow | {"secondary_samples": options.secondary_samples}
     return [
         Subject("envmap_hybrid", both | {"table": PAPER_CLUSTER}),
@@ -146,7 +147,12 @@ def _paper_subjects(options: Options) -> list[Subject]:
 
 def _default_subjects(options: Options) -> list[Subject]:
     """The same with our defaults; clusters are found automatically."""
-    return [Subject(name, {"patches": options.patches}) for name in PRINTED]
+    return [Subject(name, _cache(options)) for name in PRINTED]
+
+
+def _cache(options: Options) -> dict[str, Any]:
+    """All use the same irradiance cache."""
+    return {"patches": options.patches, "patch_samples": options.patch_samples}
 
 
 def _count(tasks: list[Task], hidden: bool) -> list[Counts]:
