@@ -15,7 +15,7 @@ OWN_SCENES = Path(__file__).parents[1] / "scenes"
 PAPER_ROOM = OWN_SCENES / "paper_room.xml"
 
 BEST_SAMPLER = "multijitter"
-"""Of Mitsuba's samplers, the one with which ``path`` has the least error (see README.md)."""
+"""Of Mitsuba's samplers, the one with which ``path`` has the least error."""
 
 
 PAPER_TABLE = ("table-top", *(f"table-leg-{i}" for i in range(1, 5)), "ball")
