@@ -96,7 +96,7 @@ def test_hidden_sources_are_passed(furnished):
 def test_preparation(furnished):
     """One gather ray of each sample of a patch; the bake comes on top."""
     counts = {}
-    for kind in ("source_selection", "envmap_hybrid"):
+    for kind in ("one_level_path", "envmap_hybrid"):
         with count_rays() as counts[kind]:
             integrator(kind).prepare(furnished)
     without, with_maps = counts.values()
