@@ -11,7 +11,7 @@ from ..parameters import Parameters
 from ..pipeline import Prepared, Settings, load, prepare
 from ..radiosity.surface_points import ObjectIds
 from ..rendering.camera import camera_radiance
-from ..rendering.transport import Transport
+from ..rendering.transport import Residual, Transport
 
 
 class CachedIntegrator(mi.SamplingIntegrator):
@@ -35,10 +35,12 @@ class CachedIntegrator(mi.SamplingIntegrator):
         )
         self.shadow_samples = parameters.integer("shadow_samples", 1, 1, 1 << 16)
         self.secondary_samples = 1
+        self.residual_probability = 0.0
         self.cache_file = parameters.text("cache_file")
         self._fingerprint = SceneFingerprint()
         self._prepared: Prepared | None = None
         self._object_ids: tuple | None = None
+        self._seed = 0
 
     # ---------------------- To be overridden ----------------------
 
@@ -94,10 +96,20 @@ class CachedIntegrator(mi.SamplingIntegrator):
 
     # ---------------------- Rendering ----------------------
 
+    def residual(self) -> Residual | None:
+        """How the errors of cache and maps are corrected, if they are."""
+        if self.residual_probability == 0:
+            return None
+        self._seed = mi.UInt32(self._seed) + 1  # Every pass of a render decides anew.
+        dr.make_opaque(self._seed)
+        probability = dr.opaque(mi.Float, self.residual_probability)
+        return Residual(probability, self._seed)
+
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
         prepared = self.prepare(scene)
+        self._seed = seed
         with dr.suspend_grad():
             # What kernels read is put in place before the first one is recorded.
             self.transport(scene, prepared, spp or sensor.sampler().sample_count())
@@ -112,7 +124,6 @@ class CachedIntegrator(mi.SamplingIntegrator):
         return camera_radiance(
             scene,
             self.transport(scene, prepared, sampler.sample_count()),
-            prepared.cache,
             sampler,
             mi.Ray3f(ray),
             mi.Bool(active),

@@ -57,6 +57,7 @@ class EnvmapBake(CachedIntegrator):
         return Transport(
             prepared.cache.patches,
             self.object_ids(scene),
+            cache=prepared.cache,
             gather_depth=0,
             shadow_samples=self.shadow_samples,
             emission=False,

@@ -64,6 +64,11 @@ class EnvmapHybrid(CachedIntegrator):
      * - mip_bias
        - |float|
        - Levels added to every look-up, -32 … 32. (Default: 0)
+     * - residual_probability
+       - |float|
+       - Probability of tracing on where the cache or a map could end a path, to correct what they
+         get wrong. Above 0 the mean is that of :monosp:`path`: there is no bias, but more
+         noise. (Default: 0)
      * - cache_file
        - |string|
        - File with the baked state, from :monosp:`envmap-render bake`. (Default: none, bake now)
@@ -96,8 +101,14 @@ class EnvmapHybrid(CachedIntegrator):
         super().__init__(props)
         parameters = Parameters(props)
         self.secondary_samples = parameters.integer("secondary_samples", 1, 1, 1 << 16)
+        self.residual_probability = parameters.number("residual_probability", 0.0, 0.0, 1.0)
         self.gather_depth = parameters.integer("gather_depth", 1, 1, 64)
         self.second_hit = parameters.choice("second_hit", "cache", ("cache", "shadow_rays"))
+        if self.residual_probability > 0 and self.second_hit == "shadow_rays":
+            raise ValueError(
+                f'{self.owner}: "residual_probability" corrects direct light from the cache too; '
+                'use it with "second_hit" = "cache"'
+            )
         self.lookup = parameters.choice("lookup", "corrected", ("corrected", "plain"))
         self.mirrors = parameters.choice("mirrors", "trace", ("trace", "map"))
         self.map_resolution = parameters.power_of_two("map_resolution", 64, 1, 2048)
@@ -137,11 +148,13 @@ class EnvmapHybrid(CachedIntegrator):
         return Transport(
             prepared.cache.patches,
             self.object_ids(scene),
+            cache=prepared.cache,
             far_field=self._far_field_of(scene, prepared, spp),
             gather_depth=self.gather_depth,
             shadow_samples=self.shadow_samples,
             shadow_rays=self.second_hit == "shadow_rays",
             hide_emitters=self.hide_emitters,
+            residual=self.residual(),
         )
 
     def _far_field_of(self, scene, prepared, spp) -> FarField | None:

@@ -30,6 +30,11 @@ class OneLevelPath(CachedIntegrator):
      * - secondary_samples
        - |int|
        - Secondary rays at a camera hit. (Default: 1)
+     * - residual_probability
+       - |float|
+       - Probability of tracing on where the cache or a map could end a path, to correct what they
+         get wrong. Above 0 the mean is that of :monosp:`path`: there is no bias, but more
+         noise. (Default: 0)
      * - cache_file
        - |string|
        - File with the baked state, from :monosp:`envmap-render bake`. (Default: none, bake now)
@@ -42,12 +47,15 @@ class OneLevelPath(CachedIntegrator):
         super().__init__(props)
         parameters = Parameters(props)
         self.secondary_samples = parameters.integer("secondary_samples", 1, 1, 1 << 16)
+        self.residual_probability = parameters.number("residual_probability", 0.0, 0.0, 1.0)
 
     def transport(self, scene, prepared, spp):
         return Transport(
             prepared.cache.patches,
             self.object_ids(scene),
+            cache=prepared.cache,
             gather_depth=1,
             shadow_samples=self.shadow_samples,
             hide_emitters=self.hide_emitters,
+            residual=self.residual(),
         )

@@ -39,6 +39,7 @@ class SourceSelection(CachedIntegrator):
         return Transport(
             prepared.cache.patches,
             self.object_ids(scene),
+            cache=prepared.cache,
             gather_depth=0,
             shadow_samples=self.shadow_samples,
             hide_emitters=self.hide_emitters,

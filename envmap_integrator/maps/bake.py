@@ -17,6 +17,8 @@ from .mipmap import build_levels
 
 #: Bake rays per kernel launch: bounds memory.
 MAX_LANES = 1 << 22
+#: Least inverse distance [1/m] under the sign of a masked texel.
+MASKED = 1e-15
 
 
 def bake_map(
@@ -91,6 +93,6 @@ def bake_map(
     weight = total[..., -1]
     value = total[..., :-1] / np.maximum(weight, 1)[..., None]
     levels = build_levels(value.astype(np.float64), weight / samples)
-    return CubeMap(
-        cluster, [level.astype(np.float32) for level in levels], float((weight == 0).mean())
-    )
+    masked = weight == 0
+    levels[0][masked, -1] = -np.maximum(levels[0][masked, -1], MASKED)
+    return CubeMap(cluster, [level.astype(np.float32) for level in levels])

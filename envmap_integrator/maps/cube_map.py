@@ -20,17 +20,21 @@ class CubeMap:
 
     cluster   what it is the map of
     levels    [6, R_l, R_l, C + 1] per level, finest first: radiance [W/m²/sr], inverse distance
-              [1/m] from the cube's centre
-    masked    share of finest texels that no ray from the cluster reaches
+              [1/m] from the cube's centre. Negative on the finest level where no ray from the
+              cluster was seen to arrive: what such texels hold is made up from their neighbours.
     """
 
     cluster: Cluster
     levels: list[np.ndarray]
-    masked: float
 
     @property
     def resolution(self) -> int:
         return self.levels[0].shape[1]
+
+    @property
+    def masked(self) -> float:
+        """Share of finest texels that hold nothing of their own."""
+        return float((self.levels[0][..., -1] < 0).mean())
 
     def texels(self) -> np.ndarray:
         """All levels in one row, [T, C + 1], as ``cube`` lays them out."""
@@ -54,7 +58,6 @@ def to_parts(cube_map: CubeMap, prefix: str = "") -> tuple[Parts, dict]:
         "radius": cluster.radius,
         "half_width": cluster.half_width,
         "resolution": cube_map.resolution,
-        "masked": cube_map.masked,
     }
     return parts, metadata
 
@@ -76,4 +79,4 @@ def from_parts(parts: Parts, metadata: dict, prefix: str = "") -> CubeMap:
         )
     except (KeyError, StopIteration) as error:
         raise StorageError(f"a part of the map is missing: {error}") from None
-    return CubeMap(cluster, levels, metadata["masked"])
+    return CubeMap(cluster, levels)

@@ -42,7 +42,8 @@ class FarField:
 
     cubes              [M * 4]   centre and half width of each cube, world units
     texels             [M * T * (C + 1)]  radiance [W/m²/sr] by C channels and inverse distance
-                                 [1/m] from the centre; T texels a map, laid out as in ``cube``
+                                 [1/m] from the centre, negative where masked; T texels a map,
+                                 laid out as in ``cube``
     cluster_of_cell    cluster index of each large cell of the coarse mesh, M where there is none
     resolution         [1]       face resolution R of the finest level
     n_samples          [1]       samples that share a pixel: spp times secondary samples
@@ -109,7 +110,7 @@ class FarField:
             b = dr.dot(offset, d)
             c = dr.squared_norm(offset)
             for _ in range(CORRECTION_STEPS):
-                inverse = self._inverse_distance(cluster, far, active)
+                inverse = dr.abs(self._inverse_distance(cluster, far, active))
                 # |offset + t d| = 1 / inverse, in a form that stands infinite distance.
                 t = dr.safe_sqrt(dr.rcp(dr.square(inverse)) - c + b * b) - b
                 far = dr.select(inverse > 0, offset + t * d, d)
@@ -119,7 +120,7 @@ class FarField:
                 inverse > 0,
                 dr.abs(inverse_at * distance - 1) < DISTANCE_TOLERANCE,
                 inverse_at == 0,
-            )
+            )  # A masked texel's inverse distance is negative.
             footprint = dr.select(inverse > 0, dr.square(t / distance), 1)
 
         face, uv = direction_to_face(far)

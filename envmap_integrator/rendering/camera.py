@@ -7,10 +7,8 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
-from ..radiosity.irradiance import IrradianceCache
 from .ray_counts import Ray, count
 from .transport import (
-    PathEnd,
     PathState,
     Transport,
     Vertex,
@@ -26,7 +24,6 @@ from .transport import (
 def camera_radiance(
     scene: mi.Scene,
     transport: Transport,
-    cache: IrradianceCache,
     sampler: mi.Sampler,
     ray: mi.Ray3f,
     active: mi.Bool,
@@ -38,17 +35,12 @@ def camera_radiance(
     """
     if transport.gather_depth == 0:
         end = follow(scene, transport, sampler, camera_path(ray), active)
-        return total(end, cache), end.distance, end.valid
-    return split(scene, transport, cache, sampler, ray, active, secondary_samples)
-
-
-def total(end: PathEnd, cache: IrradianceCache) -> mi.Spectrum:
-    """Radiance [W/m²/sr] of a path, with what it found in the cache."""
-    return end.radiance + end.weight * cache.irradiance(end.row) * dr.inv_pi
+        return end.radiance, end.distance, end.valid
+    return split(scene, transport, sampler, ray, active, secondary_samples)
 
 
 @dr.syntax
-def split(scene, transport, cache, sampler, ray, active, secondary_samples):
+def split(scene, transport, sampler, ray, active, secondary_samples):
     """Shade the first hit once and send secondary rays from it.
 
     The first vertex stands outside the loop over the others also for a single secondary ray: it
@@ -70,7 +62,7 @@ def split(scene, transport, cache, sampler, ray, active, secondary_samples):
         mapped = smooth | (hit & transport.far_field.map_mirrors)
         cell, _, found = transport.patches.find_cell(si.p, facing(si, ray), object_id, mapped)
         cube = transport.far_field.cube(cell, si.p, found)
-    vertex = Vertex(si, bsdf, mi.Bool(False), mi.Bool(False), cube)
+    vertex = Vertex(si, bsdf, mi.Bool(False), mi.Bool(False), cube, mi.Float(1))
 
     emitted = si.emitter(scene).eval(si, active & (not transport.hide_emitters))
     n_shadow = transport.shadow_samples
@@ -84,16 +76,16 @@ def split(scene, transport, cache, sampler, ray, active, secondary_samples):
     valid = active & (scene.environment() is not None and not transport.hide_emitters)
     if dr.hint(secondary_samples == 1, mode="scalar"):
         u = sampler.next_1d()
-        arriving, solid = secondary(scene, beyond, cache, sampler, vertex, u, hit)
+        arriving, solid = secondary(scene, beyond, sampler, vertex, u, hit)
         radiance += arriving
         valid |= solid
     else:
         i = mi.UInt32(0)
         arriving = mi.Spectrum(0)
         pending = mi.Bool(hit)
-        while dr.hint(pending, exclude=[beyond, cache, vertex], label="Secondary rays"):
+        while dr.hint(pending, exclude=[beyond, vertex], label="Secondary rays"):
             u = (mi.Float(i) + sampler.next_1d()) / mi.Float(secondary_samples)
-            one, solid = secondary(scene, beyond, cache, sampler, vertex, u, pending)
+            one, solid = secondary(scene, beyond, sampler, vertex, u, pending)
             arriving += one
             valid |= pending & solid
             i += 1
@@ -102,7 +94,7 @@ def split(scene, transport, cache, sampler, ray, active, secondary_samples):
     return radiance, dr.select(hit, si.t, dr.inf), valid
 
 
-def secondary(scene, transport, cache, sampler, vertex, u, active):
+def secondary(scene, transport, sampler, vertex, u, active):
     """One secondary ray: radiance [W/m²/sr] that it brings, and whether the surface is solid."""
     si = vertex.si
     bs, weight = vertex.bsdf.sample(mi.BSDFContext(), si, u, sampler.next_2d(), active)
@@ -125,4 +117,4 @@ def secondary(scene, transport, cache, sampler, vertex, u, active):
         )
     end = follow(scene, transport, sampler, start, active & (dr.max(weight) > 0))
     solid = active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
-    return weight * total(end, cache), end.valid | solid
+    return weight * end.radiance, end.valid | solid

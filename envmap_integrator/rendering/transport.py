@@ -22,8 +22,9 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..jit import SpareNumbers
+from ..jit import SpareNumbers, mix
 from ..maps.far_field import Cube, FarField
+from ..radiosity.irradiance import IrradianceCache
 from ..radiosity.patches import Patches
 from ..radiosity.surface_points import ObjectIds
 from .ray_counts import Ray, count, count_secondary
@@ -32,8 +33,36 @@ from .ray_counts import Ray, count, count_secondary
 #: stand-in would misplace the light: they are traced on instead of read from the cache.
 #: (A cosine lobe has 0.32 at most.)
 NARROW_PDF = 1.0
+#: Choices among the lobes of a surface that the cache serves: those that it can't stand for, such
+#: as the gloss of a varnish, are found as many times more often as if one choice were made.
+LOBE_CHOICES = 4
 #: Bounces before Russian roulette may end a path that neither cache nor map has ended.
 RR_DEPTH = 6
+
+
+#: Neighbouring lanes that decide alike whether to estimate a residual: they share SIMD registers.
+LANES_ALIKE = 16
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Estimate by further tracing what cache and maps get wrong, now and then.
+
+    Where a path could end with light B of the cache or a map, it goes on with probability q and
+    finds light X; B + (X - B) / q then stands for it, B otherwise. The mean is that of X whatever
+    B is: an unbiased control variate.
+
+    probability   q at the first opportunity of a path
+    seed          of the decisions
+    """
+
+    probability: mi.Float
+    seed: mi.UInt32
+
+    def decision(self, lane, bounces):
+        """A random number in the unit interval for each bounce of each group of lanes."""
+        group = lane // LANES_ALIKE
+        return mi.Float(mix(mix(self.seed ^ group * 0x9E3779B1) + bounces) >> 8) / 16777216.0
 
 
 @dataclass(frozen=True)
@@ -48,6 +77,9 @@ class Transport:
     shadow_rays      direct light by shadow rays also where the cache could give it
     emission         whether sources count where the first ray hits them
     hide_emitters    sources seen by camera rays are left out, as in Mitsuba
+    cache            irradiance on the patches; None while it is being made, when a path's only end
+                     in a patch is recorded
+    residual         how the errors of cache and maps are estimated, or None to leave them
     """
 
     patches: Patches
@@ -58,6 +90,8 @@ class Transport:
     shadow_rays: bool = False
     emission: bool = True
     hide_emitters: bool = False
+    cache: IrradianceCache | None = None
+    residual: Residual | None = None
 
 
 @dataclass
@@ -89,7 +123,7 @@ class PathState:
 class PathEnd:
     """What a path found: ``radiance + weight * E[row] / pi`` is the light it brings.
 
-    radiance   [W/m²/sr]  from sources and maps
+    radiance   [W/m²/sr]  from sources, maps and the cache, if there is one yet
     direct     [W/m²/sr]  the part of it that came from sources on the first ray
     weight     [1]        throughput times albedo at the patch the path ended in, 0 if none
     row        [1]        row of the irradiance table (2 * patch, + 1 for indirect light only)
@@ -141,6 +175,7 @@ def follow(
     patches = transport.patches
     far_field = transport.far_field
     hide_emitters = transport.hide_emitters
+    cache, residual = transport.cache, transport.residual
 
     # ---------------------- Loop state ----------------------
 
@@ -162,13 +197,21 @@ def follow(
     # As in path, a visible environment is never transparent.
     valid = active & (scene.environment() is not None and not hide_emitters)
     distance = mi.Float(dr.inf)
+    going_on = mi.Float(0)  # Probability of going on where the cache or a map could end the path
+    lane = dr.arange(mi.UInt32, dr.width(ray))
+    if dr.hint(residual is not None, mode="scalar"):
+        going_on = mi.Float(residual.probability)
     active = mi.Bool(active)
     if dr.hint(start.primary, mode="scalar"):
         count(Ray.PRIMARY, ray, active)
     else:
         count_secondary(ray, bounded, mi.Bool(False), active)
 
-    while dr.hint(active, exclude=[transport, patches, far_field], label="Trace near, look up far"):
+    while dr.hint(
+        active,
+        exclude=[transport, patches, far_field, cache, residual],
+        label="Trace near, look up far",
+    ):
         # ---------------------- Trace near ----------------------
 
         spare = SpareNumbers(sampler.next_1d())
@@ -182,6 +225,10 @@ def follow(
         # ---------------------- Look up far ----------------------
 
         retrace = mi.Bool(False)
+        goes_on = mi.Bool(False)
+        if dr.hint(residual is not None, mode="scalar"):
+            goes_on = active & (residual.decision(lane, bounces) < going_on)
+        far_residual, far_going_on = mi.Bool(False), mi.Float(1)
         source_si = si
         source_active = active & (si.t <= reach)
         if dr.hint(far_field is not None, mode="scalar"):
@@ -189,8 +236,11 @@ def follow(
             far_radiance, trusted = far_field.eval(
                 cluster, ray.o, ray.d, pdf, specular, spare.next_1d(), spare.next_2d(), left
             )
-            radiance[left & trusted] += throughput * far_radiance
-            retrace = left & ~trusted
+            far_residual = left & trusted & goes_on
+            far_going_on = mi.Float(going_on)
+            share = dr.select(far_residual, 1 - dr.rcp(going_on), 1)
+            radiance[left & trusted] += throughput * share * far_radiance
+            retrace = left & (~trusted | goes_on)
             source_active &= ~left
             if dr.hint(far_field.sources is not None, mode="scalar"):
                 searching = left & trusted & (reach == dr.inf)
@@ -227,6 +277,8 @@ def follow(
         # contacts). The threshold is random, so that no border shows.
         near = (bounces > 0) & (dr.norm(si.p - origin.p) < size * (0.5 + spare.next_1d()))
         served = has_patch & ~near
+        residual_here = served & goes_on
+        served &= ~goes_on
         # Total irradiance stands for direct light too.
         lit = served & (depth > 0)
         if dr.hint(transport.shadow_rays, mode="scalar"):
@@ -234,7 +286,8 @@ def follow(
         cube = None
         if dr.hint(far_field is not None, mode="scalar"):
             cube = far_field.cube(cell, si.p, found)
-        vertex = Vertex(si, bsdf, served, lit, cube)
+        boost = dr.select(residual_here, dr.rcp(going_on), 1)
+        vertex = Vertex(si, bsdf, served, lit, cube, boost)
         sampled = smooth & ~(lit & only_wide(bsdf))
         if dr.hint(transport.shadow_samples > 1, mode="scalar"):
             # Camera hits get several; further on one more sample of the pixel serves better.
@@ -251,14 +304,38 @@ def follow(
 
         # ---------------------- End in the cache ----------------------
 
-        throughput = dr.select(retrace, throughput, throughput * bsdf_weight)
-        eta = dr.select(retrace, eta, eta * bs.eta)
-        valid |= hit & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         sampled_specular = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         wide = is_wide(si, bs.wo, bs.pdf) & ~sampled_specular
         ends = served & wide
-        weight[ends] = throughput
-        row[ends] = 2 * patch + dr.select(lit, mi.UInt32(0), mi.UInt32(1))
+        total = lit | residual_here
+        cached_row = 2 * patch + dr.select(total, mi.UInt32(0), mi.UInt32(1))
+        if dr.hint(cache is None, mode="scalar"):
+            weight[ends] = throughput * bsdf_weight
+            row[ends] = cached_row
+        else:
+            cached_weight = dr.select(ends, bsdf_weight, 0)
+            several = served & ~single_lobe(bsdf)
+            choice = choose_lobes(bsdf, si, sampler, several)
+            cached_weight = dr.select(several, choice.cached, cached_weight)
+            bs = dr.select(several, choice.bs, bs)
+            bsdf_weight = dr.select(several, choice.weight, bsdf_weight)
+            sampled_specular = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+            wide &= ~several
+            ends = dr.select(several, dr.max(bsdf_weight) == 0, ends)
+            if dr.hint(residual is not None, mode="scalar"):
+                residual_here &= wide
+                cached_weight = dr.select(residual_here, (1 - boost) * bsdf_weight, cached_weight)
+                bsdf_weight = dr.select(residual_here, boost * bsdf_weight, bsdf_weight)
+                # Later residuals count less by the albedo, and deserve as much less effort.
+                going_on[residual_here] = dr.clip(dr.max(bsdf_weight) / boost, 0.1, 1)
+                going_on[far_residual] = 1
+            in_cache = dr.any(cached_weight != 0)
+            irradiance = cache.irradiance(cached_row, in_cache)
+            radiance += throughput * cached_weight * irradiance * dr.inv_pi
+        throughput = dr.select(retrace, throughput, throughput * bsdf_weight)
+        throughput[far_residual] *= dr.rcp(far_going_on)
+        eta = dr.select(retrace, eta, eta * bs.eta)
+        valid |= hit & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
 
         # ---------------------- Next ray ----------------------
 
@@ -271,7 +348,7 @@ def follow(
         specular = dr.select(retrace, specular, sampled_specular)
         origin = dr.select(retrace, origin, mi.Interaction3f(si))
         depth += dr.select(hit & ~sampled_specular, mi.UInt32(1), mi.UInt32(0))
-        counted = retrace & (reach < dr.inf)
+        counted = retrace & ((reach < dr.inf) | far_residual)
         reach = mi.Float(dr.inf)
         if dr.hint(far_field is not None, mode="scalar"):
             cluster = cube.cluster
@@ -304,6 +381,7 @@ class Vertex:
     served     whether the cache holds light for it
     lit        whether the cache's light includes direct light
     cube       the cube that bounds secondary rays from it, or None
+    boost      factor [1] on light that wide lobes reflect
     """
 
     si: mi.SurfaceInteraction3f
@@ -311,6 +389,7 @@ class Vertex:
     served: mi.Bool
     lit: mi.Bool
     cube: Cube | None
+    boost: mi.Float
 
     def reflected(self, scene, ds, em_weight, bsdf_value, bsdf_pdf, active):
         """Light [W/m²/sr] reflected from a sampled direction to a source.
@@ -328,7 +407,7 @@ class Vertex:
                 wide & self.cube.valid & (infinite | (self.cube.exit(self.si.p, ds.d) < ds.dist))
             )
         mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, dr.select(alone, 0, bsdf_pdf)))
-        light = bsdf_value * em_weight * mis
+        light = bsdf_value * em_weight * mis * dr.select(wide, self.boost, 1)
         active = active & (ds.pdf != 0) & ~(cached & self.lit) & (dr.max(light) > 0)
         ray = self.si.spawn_ray_to(ds.p)
         count(Ray.SHADOW, ray, active)
@@ -363,6 +442,52 @@ def sample_source(scene, vertex, u, active):
     wo = si.to_local(ds.d)
     bsdf_value, bsdf_pdf = vertex.bsdf.eval_pdf(mi.BSDFContext(), si, wo, active)
     return vertex.reflected(scene, ds, em_weight, bsdf_value, bsdf_pdf, active)
+
+
+@dataclass
+class LobeChoice:
+    """What several choices among the lobes of a surface come to.
+
+    cached   weight [1] of the wide lobes, which end in the cache
+    bs       a direction of the others
+    weight   and its weight [1], zero if none was chosen
+    """
+
+    cached: mi.Spectrum
+    bs: mi.BSDFSample3f
+    weight: mi.Spectrum
+
+
+@dr.syntax
+def choose_lobes(bsdf, si, sampler, active):
+    """Sample a material ``LOBE_CHOICES`` times, stratified over its lobes."""
+    count = LOBE_CHOICES
+    cached, weight = mi.Spectrum(0), mi.Spectrum(0)
+    bs = dr.zeros(mi.BSDFSample3f)
+    i, n_narrow = mi.UInt32(0), mi.UInt32(0)
+    active = mi.Bool(active)
+    u = sampler.next_1d()
+    while dr.hint(active, exclude=[bsdf, si], label="Choose lobes"):
+        lobe = (mi.Float(i) + u) / count
+        one, one_weight = bsdf.sample(mi.BSDFContext(), si, lobe, sampler.next_2d(), active)
+        delta = mi.has_flag(one.sampled_type, mi.BSDFFlags.Delta)
+        wide = is_wide(si, one.wo, one.pdf) & ~delta
+        cached += dr.select(wide, one_weight, 0)
+        # One of the narrow ones stands for all of them.
+        narrow = ~wide & (dr.max(one_weight) > 0)
+        n_narrow[narrow] += 1
+        taken = narrow & (sampler.next_1d() * mi.Float(n_narrow) < 1)
+        bs = dr.select(taken, one, bs)
+        weight = dr.select(taken, one_weight, weight)
+        i += 1
+        active &= i < count
+    return LobeChoice(cached / count, bs, weight * mi.Float(n_narrow) / count)
+
+
+def single_lobe(bsdf):
+    """Does a material scatter by diffuse reflection alone?"""
+    others = mi.BSDFFlags.Glossy | mi.BSDFFlags.Delta | mi.BSDFFlags.DiffuseTransmission
+    return (bsdf.flags() & int(others)) == 0
 
 
 def only_wide(bsdf):

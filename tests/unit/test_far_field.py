@@ -70,7 +70,7 @@ def room_levels() -> list[np.ndarray]:
 
 def field_of(levels, scene=None, n_samples=1, mip_bias=0.0, corrected=True, mirrors=False):
     """The far field of one map; cell 0 is in its cluster, cell 1 in none."""
-    cube_map = CubeMap(Cluster("cluster", CENTRE, CUBE / 2, CUBE), levels, 0.0)
+    cube_map = CubeMap(Cluster("cluster", CENTRE, CUBE / 2, CUBE), levels)
     clusters = np.array([0, 1], dtype=np.uint32)
     scene = scene or scene_of()
     return far_field(scene, (cube_map,), clusters, n_samples, mip_bias, corrected, mirrors)

@@ -31,7 +31,7 @@ def map_of(radiance: np.ndarray, name: str = "cluster") -> CubeMap:
     distance = np.full((*radiance.shape[:-1], 1), 0.5)
     levels = build_levels(np.concatenate([radiance, distance], -1), np.ones(radiance.shape[:-1]))
     cluster = Cluster(name, np.array([0.1, 0.2, 0.3]), 0.4, 0.8)
-    return CubeMap(cluster, [level.astype(np.float32) for level in levels], 0.25)
+    return CubeMap(cluster, [level.astype(np.float32) for level in levels])
 
 
 def random_radiance(channels: int = 3, sparse: bool = False) -> np.ndarray:
