@@ -84,7 +84,9 @@ def bake_map(
             radiance, distance = radiance_distance(sampler, mi.Ray3f(o, d), reached)
             value = [*radiance, dr.rcp(start + distance)]
             value = [dr.select(reached & dr.isfinite(c), c, 0) for c in value]
-            total = [dr.block_sum(c, samples) for c in (*value, dr.select(reached, 1.0, 0.0))]
+            value.append(dr.select(reached, 1.0, 0.0))
+            dr.eval(value)  # Once: each block sum would trace all rays anew.
+            total = [dr.block_sum(c, samples) for c in value]
             dr.eval(total)
             sums.append(np.stack([t.numpy() for t in total], axis=-1))
             advance(end - begin)

@@ -128,12 +128,15 @@ def _gather(scene, transport, members, begin, end, samples, seed):
     direct += dr.pi * end_.direct
     escaped = dr.pi * (end_.radiance - end_.direct)
 
-    def mean(x):
-        return type(x)(*(dr.block_sum(finite(c), samples) / samples for c in x))
+    def each(function, x):
+        return type(x)(*(function(component) for component in x))
 
-    direct, escaped = mean(direct), mean(escaped)
-    weight = type(end_.weight)(*(finite(c) for c in end_.weight))
+    direct, escaped, weight = (each(finite, x) for x in (direct, escaped, end_.weight))
+    # Block sums evaluate what they sum up: without this, each of them would trace all rays anew.
     dr.eval(direct, escaped, weight, end_.row)
+    direct, escaped = (
+        each(lambda c: dr.block_sum(c, samples) / samples, x) for x in (direct, escaped)
+    )
     return direct, escaped, weight, end_.row
 
 

@@ -153,7 +153,8 @@ def _hits_along(
     active = dr.full(mi.Bool, True, dr.width(ray))
     parts = []
     for _ in range(n_hits):
-        dr.eval(ray, active)
+        sampler.schedule_state()
+        dr.make_opaque(ray, active)  # One kernel for all hits: nothing is a literal in the first.
         count(Ray.SURVEY, ray, active)
         si = scene.ray_intersect(ray, active)
         active &= si.is_valid()
