@@ -43,14 +43,33 @@ def direction_to_face(d: mi.Vector3f) -> tuple[mi.UInt32, mi.Point2f]:
     return face, mi.Point2f(u, v) / dr.abs(major)
 
 
-def face_to_direction(face: mi.UInt32, uv: mi.Point2f) -> mi.Vector3f:
-    """Direction (not normalised) of a point on the plane of a face; (u, v) may lie off the face."""
-    major = dr.select((face & 1) == 0, mi.Float(1), mi.Float(-1))
+def face_to_direction(face: mi.UInt32, uv: mi.Point2f, depth: mi.Float = 1.0) -> mi.Vector3f:
+    """Direction (not normalised) of a point on a face, or on a parallel plane at ``depth``."""
+    major = dr.select((face & 1) == 0, mi.Float(depth), -mi.Float(depth))
     axis = face >> 1
     x = dr.select(axis == 0, major, dr.select(axis == 1, uv.y, uv.x))
     y = dr.select(axis == 0, uv.x, dr.select(axis == 1, major, uv.y))
     z = dr.select(axis == 0, uv.y, dr.select(axis == 1, uv.x, major))
     return mi.Vector3f(x, y, z)
+
+
+def fold(face: mi.UInt32, uv: mi.Point2f, u: mi.Float) -> tuple[mi.UInt32, mi.Point2f]:
+    """Face and (u, v) of a point that may lie off its face by up to that face's width.
+
+    What is off is folded over the edge, as far beyond it and at the same place along it, so that
+    points spread around one on an edge fall on the same texels whichever of its faces they come
+    from. Beyond a corner there are only three faces: ``u``, uniform in the unit interval, gives
+    each a third.
+    """
+    over = dr.maximum(dr.abs(uv) - 1, 0)
+    corner = (over.x > 0) & (over.y > 0)
+    over.x = dr.select(corner & (u > 1 / 3), 0, over.x)
+    over.y = dr.select(corner & (u < 2 / 3), 0, over.y)
+    # Off the diagonals, where two faces would claim it.
+    inside = 1 - 1e-6
+    u_ = dr.select(over.x > 0, dr.sign(uv.x), dr.clip(uv.x, -inside, inside))
+    v_ = dr.select(over.y > 0, dr.sign(uv.y), dr.clip(uv.y, -inside, inside))
+    return direction_to_face(face_to_direction(face, mi.Point2f(u_, v_), 1 - over.x - over.y))
 
 
 def texel(face: mi.UInt32, uv: mi.Point2f, resolution, level_resolution) -> mi.UInt32:

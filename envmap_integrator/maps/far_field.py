@@ -10,7 +10,7 @@ import numpy as np
 
 from ..jit import upload
 from ..rendering.ray_counts import Ray, count
-from .cube import direction_to_face, exit_distance, face_to_direction, n_texels, texel
+from .cube import direction_to_face, exit_distance, fold, n_texels, texel
 from .cube_map import CubeMap
 
 #: Steps of the fixed point iteration that finds the far hit (Szirmay-Kalos et al. 2005).
@@ -130,12 +130,12 @@ class FarField:
         texels *= (1 + dr.squared_norm(uv)) ** 1.5
         level = 0.5 * dr.log2(dr.maximum(texels, 1e-6)) + self.mip_bias
         coarsest = mi.Float(31 - dr.lzcnt(self.resolution))
-        # Stochastic trilinear filtering: one packed gather, seam free because the jittered
-        # direction may fall on a neighbouring face.
+        # Stochastic trilinear filtering: one packed gather. Low bits of the random number choose
+        # the face where three meet.
         level = mi.UInt32(dr.clip(dr.floor(level + u_level), 0, coarsest))
         level_resolution = self.resolution >> level
         uv += (2 * u_texel - 1) / mi.Float(level_resolution)
-        face, uv = direction_to_face(face_to_direction(face, uv))
+        face, uv = fold(face, uv, 256 * u_texel.x - dr.floor(256 * u_texel.x))
         value = self._fetch(cluster, face, uv, level_resolution, active)
         n_channels = len(mi.Spectrum())
         return mi.Spectrum(*(value[i] for i in range(n_channels))), trusted

@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..jit import upload
+from ..jit import mix, upload
 from ..progress import stage
 from ..rendering.ray_counts import Ray, count
 from .patch_points import PatchPoints
@@ -142,10 +142,9 @@ def _gather(scene, transport, members, begin, end, samples, seed):
 
 def _rotated(x, y, rank, seed) -> mi.Point2f:
     """A point set moved round the unit square, by another shift for every patch."""
-    shift = mi.Point2f(
-        mi.sample_tea_float32(2 * rank, dr.opaque(mi.UInt32, seed), 4),
-        mi.sample_tea_float32(2 * rank + 1, dr.opaque(mi.UInt32, seed), 4),
-    )
+    seed_ = dr.opaque(mi.UInt32, seed)
+    bits = (mix(mix(2 * rank + axis) ^ seed_) for axis in range(2))
+    shift = mi.Point2f(*(mi.Float(b >> 8) / 16777216.0 for b in bits))
     point = mi.Point2f(x, y) + shift
     return point - dr.floor(point)
 
