@@ -63,7 +63,8 @@ class EnvmapHybrid(CachedIntegrator):
        - Half width of a cube over the radius of its cluster, at least 1. (Default: 2)
      * - mip_bias
        - |float|
-       - Levels added to every look-up, -32 … 32. (Default: 0)
+       - Levels added to every look-up, -32 … 32. Below 0, less blur: a texel covers a part of what
+         the sample stands for. (Default: -2)
      * - residual_probability
        - |float|
        - Probability of tracing on where the cache or a map could end a path, to correct what they
@@ -104,16 +105,11 @@ class EnvmapHybrid(CachedIntegrator):
         self.residual_probability = parameters.number("residual_probability", 0.0, 0.0, 1.0)
         self.gather_depth = parameters.integer("gather_depth", 1, 1, 64)
         self.second_hit = parameters.choice("second_hit", "cache", ("cache", "shadow_rays"))
-        if self.residual_probability > 0 and self.second_hit == "shadow_rays":
-            raise ValueError(
-                f'{self.owner}: "residual_probability" corrects direct light from the cache too; '
-                'use it with "second_hit" = "cache"'
-            )
         self.lookup = parameters.choice("lookup", "corrected", ("corrected", "plain"))
         self.mirrors = parameters.choice("mirrors", "trace", ("trace", "map"))
         self.map_resolution = parameters.power_of_two("map_resolution", 64, 1, 2048)
         self.distance_ratio = parameters.number("distance_ratio", 2.0, 1.0)
-        self.mip_bias = parameters.number("mip_bias", 0.0, -32.0, 32.0)
+        self.mip_bias = parameters.number("mip_bias", -2.0, -32.0, 32.0)
 
         self.baker = None
         requests = []

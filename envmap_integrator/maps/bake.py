@@ -78,6 +78,7 @@ def bake_map(
             si.n = dr.gather(mi.Normal3f, normals, k)
             reached = dr.dot(o - si.p, si.n) > 0
             ray = si.spawn_ray_to(o)
+            ray.maxt = dr.norm(o - ray.o)  # No shorter: the start may lie just behind a wall.
             count(Ray.SURVEY, ray, reached)
             reached &= ~scene.ray_test(ray, reached)
 

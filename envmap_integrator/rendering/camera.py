@@ -62,7 +62,7 @@ def split(scene, transport, sampler, ray, active, secondary_samples):
         mapped = smooth | (hit & transport.far_field.map_mirrors)
         cell, _, found = transport.patches.find_cell(si.p, facing(si, ray), object_id, mapped)
         cube = transport.far_field.cube(cell, si.p, found)
-    vertex = Vertex(si, bsdf, mi.Bool(False), mi.Bool(False), cube, mi.Float(1))
+    vertex = Vertex(si, bsdf, mi.Bool(False), cube, mi.Float(1))
 
     emitted = si.emitter(scene).eval(si, active & (not transport.hide_emitters))
     n_shadow = transport.shadow_samples

@@ -277,18 +277,19 @@ def follow(
         # contacts). The threshold is random, so that no border shows.
         near = (bounces > 0) & (dr.norm(si.p - origin.p) < size * (0.5 + spare.next_1d()))
         served = has_patch & ~near
-        residual_here = served & goes_on
-        served &= ~goes_on
-        # Total irradiance stands for direct light too.
-        lit = served & (depth > 0)
+        # Total irradiance stands for direct light too, but not where that may shine.
+        lit = served & (depth > 0) & only_wide(bsdf)
         if dr.hint(transport.shadow_rays, mode="scalar"):
             lit = mi.Bool(False)
+        residual_here = served & goes_on
+        shadow_rays_alone = served & ~(residual_here & lit)
+        served &= ~goes_on
         cube = None
         if dr.hint(far_field is not None, mode="scalar"):
             cube = far_field.cube(cell, si.p, found)
         boost = dr.select(residual_here, dr.rcp(going_on), 1)
-        vertex = Vertex(si, bsdf, served, lit, cube, boost)
-        sampled = smooth & ~(lit & only_wide(bsdf))
+        vertex = Vertex(si, bsdf, shadow_rays_alone, cube, dr.select(lit, boost, 1))
+        sampled = smooth & ~(lit & served)
         if dr.hint(transport.shadow_samples > 1, mode="scalar"):
             # Camera hits get several; further on one more sample of the pixel serves better.
             n = dr.select(depth == 0, mi.UInt32(transport.shadow_samples), mi.UInt32(1))
@@ -307,8 +308,7 @@ def follow(
         sampled_specular = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         wide = is_wide(si, bs.wo, bs.pdf) & ~sampled_specular
         ends = served & wide
-        total = lit | residual_here
-        cached_row = 2 * patch + dr.select(total, mi.UInt32(0), mi.UInt32(1))
+        cached_row = 2 * patch + dr.select(lit, mi.UInt32(0), mi.UInt32(1))
         if dr.hint(cache is None, mode="scalar"):
             weight[ends] = throughput * bsdf_weight
             row[ends] = cached_row
@@ -349,6 +349,7 @@ def follow(
         origin = dr.select(retrace, origin, mi.Interaction3f(si))
         depth += dr.select(hit & ~sampled_specular, mi.UInt32(1), mi.UInt32(0))
         counted = retrace & ((reach < dr.inf) | far_residual)
+        counted |= ~retrace & shadow_rays_alone & wide
         reach = mi.Float(dr.inf)
         if dr.hint(far_field is not None, mode="scalar"):
             cluster = cube.cluster
@@ -378,28 +379,25 @@ class Vertex:
     """A surface that reflects light from sources.
 
     si, bsdf   the surface
-    served     whether the cache holds light for it
-    lit        whether the cache's light includes direct light
+    alone      whether rays that wide lobes send on count no sources
     cube       the cube that bounds secondary rays from it, or None
     boost      factor [1] on light that wide lobes reflect
     """
 
     si: mi.SurfaceInteraction3f
     bsdf: mi.BSDFPtr
-    served: mi.Bool
-    lit: mi.Bool
+    alone: mi.Bool
     cube: Cube | None
     boost: mi.Float
 
     def reflected(self, scene, ds, em_weight, bsdf_value, bsdf_pdf, active):
         """Light [W/m²/sr] reflected from a sampled direction to a source.
 
-        Wide lobes aren't traced on where the cache serves the surface, nor beyond its cube. From
-        there, shadow rays alone bring light, or the cache alone where it has lit the surface.
+        For wide lobes, shadow rays alone bring light from beyond the cube, and all of it where the
+        cache ends the path.
         """
         wide = is_wide(self.si, self.si.to_local(ds.d), bsdf_pdf)
-        cached = wide & self.served
-        alone = cached
+        alone = wide & self.alone
         if self.cube is not None:
             # The distance of an environment is made up.
             infinite = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
@@ -408,7 +406,7 @@ class Vertex:
             )
         mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, dr.select(alone, 0, bsdf_pdf)))
         light = bsdf_value * em_weight * mis * dr.select(wide, self.boost, 1)
-        active = active & (ds.pdf != 0) & ~(cached & self.lit) & (dr.max(light) > 0)
+        active = active & (ds.pdf != 0) & (dr.max(light) > 0)
         ray = self.si.spawn_ray_to(ds.p)
         count(Ray.SHADOW, ray, active)
         active &= ~scene.ray_test(ray, active)
