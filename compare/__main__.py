@@ -11,6 +11,7 @@ from types import ModuleType
 from compare import report
 from compare.experiments import (
     algorithms,
+    bias,
     complexity,
     distance,
     error_vs_time,
@@ -27,6 +28,7 @@ EXPERIMENTS: dict[str, ModuleType] = {
     "algorithms": algorithms,
     "error-vs-time": error_vs_time,
     "complexity": complexity,
+    "bias": bias,
     "render": render,
 }
 """Each module has ``Options`` and ``run(options, folder)``; its docstring is the help."""

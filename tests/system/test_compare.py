@@ -8,11 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from compare import report
+from compare import report, variants
 from compare.__main__ import EXPERIMENTS, main
+from compare.contributions import Ledger
 from compare.experiments import error_vs_time
 from compare.options import JudgedOptions
-from compare.references import reference
+from compare.references import Reference, reference
 from compare.runs import Task, interleave
 from compare.scenes import HYBRID, PAPER_ROOM, PATH, Subject, View
 
@@ -38,6 +39,7 @@ TINY = {
         "clusters": (0, 1),
         "resolutions": (8, 16),
     },
+    "bias": {"spp": 4, "patches": 256, "finer": 4},
     "render": {"spp": 4},
 }
 
@@ -133,6 +135,51 @@ def test_path_with_twice_the_samples_has_half_the_variance(references):
     outcome = error_vs_time.compare(view, [PATH], options, judged_by)
     few, many = np.mean(outcome.numbers["curves"][0]["errors"], axis=1)
     assert few / many == pytest.approx(2, rel=0.1)
+
+
+def test_shares_of_known_errors():
+    """Noise counts for nothing, whether variants share it or not; shares of steps add up."""
+    rng = np.random.default_rng(1)
+
+    def noise(size):
+        return size * rng.standard_normal((24, 32, 3))
+
+    flat = np.ones((24, 32, 3))
+    left, right = 0.3 * flat, -0.1 * flat
+    left[:, 16:] = right[:, :16] = 0
+    exact = [flat + noise(0.2) for _ in range(8)]
+    without_left = [one + right + noise(0.02) for one in exact]
+    default = [one + left + right for one in exact]
+    judged_by = Reference(flat + noise(0.01), flat + noise(0.01), 1, [1.0, 1.001, 0.999])
+    ledger = Ledger(np.subtract(default, exact), judged_by)
+
+    whole = (0.3**2 + 0.1**2) / 2 / 1.01
+    assert ledger.of_pictures(default).rel_mse.value == pytest.approx(whole, abs=3e-3)
+    assert ledger.of_pictures(exact).rel_mse.value == pytest.approx(0, abs=3e-3)
+    steps = (default, without_left), (without_left, exact)
+    found = [ledger.of_errors(np.subtract(*step)) for step in steps]
+    for one, share, mean in zip(found, (0.9, 0.1), (0.15, -0.05), strict=True):
+        assert one.rel_mse.value == pytest.approx(share * whole, rel=0.02)
+        assert one.left.value == pytest.approx((1 - share) * whole, rel=0.02)
+        assert one.share.value == pytest.approx(share, abs=0.005)
+        assert one.mean_bias.value == pytest.approx(mean, abs=0.002)
+    assert sum(one.share.value for one in found) == pytest.approx(1)
+
+
+def test_replaced_approximations_are_put_back():
+    """Outside their contexts nothing is replaced, not even after an error."""
+
+    def replaceable():
+        far_field, transport = variants.FarField, variants.transport
+        return far_field.eval, far_field._inverse_distance, variants.Patches.find, transport.is_wide
+
+    before = replaceable()
+    for variant in variants.variants(patches=256, finer=4).values():
+        for replaced in variant.replaced:
+            with pytest.raises(KeyError), replaced():
+                assert replaceable() != before
+                raise KeyError
+            assert replaceable() == before
 
 
 # ---------------------- References ----------------------
