@@ -18,10 +18,12 @@ from .maps.clusters import (
     listed_clusters,
 )
 from .maps.cube_map import CubeMap, from_parts, to_parts
+from .radiosity.direct_light import choose_sources, survey_direct_light
 from .radiosity.evenness import drop_uneven
 from .radiosity.irradiance import IrradianceCache, solve_irradiance
 from .radiosity.patches import Patches, build_patches
 from .radiosity.surface_points import ObjectIds, scatter_points
+from .rendering.source_choice import Emitters
 from .rendering.transport import Transport
 from .storage import StorageError, read, write
 
@@ -49,6 +51,7 @@ class Prepared:
 
     key                content hash of the scene, and the settings
     cache              irradiance on the patches
+    sources            [R * L * 4]  probabilities of the emitters (``SourceChoice.table``)
     maps               one cube map per cluster
     cluster_of_cell    cluster index of each large cell, ``len(maps)`` where there is none
     stage_times        seconds spent in each stage
@@ -56,6 +59,7 @@ class Prepared:
 
     key: str
     cache: IrradianceCache
+    sources: mi.Float
     maps: tuple[CubeMap, ...] = ()
     cluster_of_cell: np.ndarray | None = None
     stage_times: dict[str, float] = field(default_factory=dict)
@@ -75,13 +79,22 @@ def prepare(scene: mi.Scene, key: str, settings: Settings, baker=None) -> Prepar
             scene, object_ids, POINTS_PER_PATCH * settings.patches, settings.map_mirrors
         )
         patches, patch_of_point, cell_of_point = build_patches(points, object_ids, settings.patches)
-        patches, patch_of_point = drop_uneven(scene, patches, points, patch_of_point)
+    with _timed(times, "direct light"):
+        emitters = Emitters(scene)
+        light = survey_direct_light(scene, emitters, points, patch_of_point, patches.count)
+        sources = choose_sources(emitters, light, cell_of_point, dr.width(patches.levels))
+        patches, patch_of_point = drop_uneven(light, patches, patch_of_point)
 
     with _timed(times, "irradiance cache"):
         cache = solve_irradiance(
-            scene, Transport(patches, object_ids), points, patch_of_point, settings.patch_samples
+            scene,
+            Transport(patches, object_ids, sources),
+            points,
+            patch_of_point,
+            cell_of_point,
+            settings.patch_samples,
         )
-    prepared = Prepared(key, cache, stage_times=times)
+    prepared = Prepared(key, cache, sources.table, stage_times=times)
     if not settings.maps:
         return prepared
 
@@ -132,6 +145,7 @@ def save(path, prepared: Prepared) -> None:
         "patches": {"fingerprint": _image(patches.cells.numpy())},
         "levels": {"entry": _image(patches.levels.numpy())},
         "irradiance": {"Y": _image(prepared.cache.table.numpy())},
+        "sources": {"alias": _image(prepared.sources.numpy())},
     }
     if prepared.cluster_of_cell is not None:
         parts["cluster_of_cell"] = {"cluster": _image(prepared.cluster_of_cell)}
@@ -148,6 +162,7 @@ def save(path, prepared: Prepared) -> None:
         "patches": patches.count,
         "use_objects": patches.use_objects,
         "channels": len(mi.Spectrum()),
+        "sources": dr.width(prepared.sources),
         "maps": maps,
         "stage_times": prepared.stage_times,
     }
@@ -184,10 +199,12 @@ def load(path, key: str, owner: str) -> Prepared:
         use_objects=metadata["use_objects"],
     )
     table = upload(mi.Float, values("irradiance", "Y", 2 * n_patches * metadata["channels"]))
+    sources = upload(mi.Float, values("sources", "alias", metadata["sources"]))
     membership = None
     if "cluster_of_cell" in parts:
         membership = values("cluster_of_cell", "cluster", metadata["levels"])
-    return Prepared(key, IrradianceCache(patches, table), maps, membership, metadata["stage_times"])
+    cache = IrradianceCache(patches, table)
+    return Prepared(key, cache, sources, maps, membership, metadata["stage_times"])
 
 
 def _image(values: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ import OpenEXR
 
 #: EXR attribute that holds our metadata, as JSON.
 ATTRIBUTE = "envmap_integrator"
-FORMAT = 1
+FORMAT = 2
 
 Parts = dict[str, dict[str, np.ndarray]]
 

@@ -11,6 +11,7 @@ from ..parameters import Parameters
 from ..pipeline import Prepared, Settings, load, prepare
 from ..radiosity.surface_points import ObjectIds
 from ..rendering.camera import camera_radiance
+from ..rendering.source_choice import Emitters, SourceChoice
 from ..rendering.transport import Residual, Transport
 
 
@@ -39,7 +40,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
         self.cache_file = parameters.text("cache_file")
         self._fingerprint = SceneFingerprint()
         self._prepared: Prepared | None = None
-        self._object_ids: tuple | None = None
+        self._scene_ids: tuple | None = None
         self._seed = 0
 
     # ---------------------- To be overridden ----------------------
@@ -86,13 +87,22 @@ class CachedIntegrator(mi.SamplingIntegrator):
                     self._prepared = prepare(scene, key, self.settings(), self.bake_with())
         return self._prepared
 
-    def object_ids(self, scene: mi.Scene) -> ObjectIds:
-        """The ids of the scene at hand: other scenes of the same content have others."""
-        # Holding on to the scene, which holds this integrator, would keep both alive for ever.
+    def transport_from(self, scene: mi.Scene, prepared: Prepared, **more) -> Transport:
+        """A ``Transport`` with all that is the same for all integrators."""
+        # Other scenes of the same content have other ids. Holding on to the scene, which holds this
+        # integrator, would keep both alive for ever.
         key = dr.reinterpret_array(mi.UInt32, scene.shapes_dr()).numpy().tobytes()
-        if self._object_ids is None or self._object_ids[0] != key:
-            self._object_ids = key, ObjectIds(scene)
-        return self._object_ids[1]
+        if self._scene_ids is None or self._scene_ids[0] != key:
+            self._scene_ids = key, ObjectIds(scene), Emitters(scene)
+        _, object_ids, emitters = self._scene_ids
+        return Transport(
+            prepared.cache.patches,
+            object_ids,
+            SourceChoice(emitters, prepared.sources),
+            cache=prepared.cache,
+            shadow_samples=self.shadow_samples,
+            **more,
+        )
 
     # ---------------------- Rendering ----------------------
 

@@ -8,7 +8,6 @@ import mitsuba as mi
 from ..maps.bake import bake_map
 from ..maps.cube_map import CubeMap
 from ..parameters import Parameters
-from ..rendering.transport import Transport
 from .common import CachedIntegrator
 
 
@@ -54,12 +53,10 @@ class EnvmapBake(CachedIntegrator):
         self.samples = Parameters(props).power_of_two("samples", 8, 1, 1 << 12)
 
     def transport(self, scene, prepared, spp):
-        return Transport(
-            prepared.cache.patches,
-            self.object_ids(scene),
-            cache=prepared.cache,
+        return self.transport_from(
+            scene,
+            prepared,
             gather_depth=0,
-            shadow_samples=self.shadow_samples,
             emission=False,
         )
 

@@ -7,7 +7,6 @@ import mitsuba as mi
 from ..emitters.mipmap_cube import MipmapCube
 from ..maps.far_field import FarField, far_field
 from ..parameters import Parameters
-from ..rendering.transport import Transport
 from .common import CachedIntegrator
 from .envmap_bake import EnvmapBake
 
@@ -141,13 +140,11 @@ class EnvmapHybrid(CachedIntegrator):
         return self.baker
 
     def transport(self, scene, prepared, spp):
-        return Transport(
-            prepared.cache.patches,
-            self.object_ids(scene),
-            cache=prepared.cache,
+        return self.transport_from(
+            scene,
+            prepared,
             far_field=self._far_field_of(scene, prepared, spp),
             gather_depth=self.gather_depth,
-            shadow_samples=self.shadow_samples,
             shadow_rays=self.second_hit == "shadow_rays",
             hide_emitters=self.hide_emitters,
             residual=self.residual(),

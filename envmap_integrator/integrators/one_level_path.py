@@ -5,7 +5,6 @@ from __future__ import annotations
 import mitsuba as mi
 
 from ..parameters import Parameters
-from ..rendering.transport import Transport
 from .common import CachedIntegrator
 
 
@@ -50,12 +49,10 @@ class OneLevelPath(CachedIntegrator):
         self.residual_probability = parameters.number("residual_probability", 0.0, 0.0, 1.0)
 
     def transport(self, scene, prepared, spp):
-        return Transport(
-            prepared.cache.patches,
-            self.object_ids(scene),
-            cache=prepared.cache,
+        return self.transport_from(
+            scene,
+            prepared,
             gather_depth=1,
-            shadow_samples=self.shadow_samples,
             hide_emitters=self.hide_emitters,
             residual=self.residual(),
         )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from ..rendering.transport import Transport
 from .common import CachedIntegrator
 
 
@@ -36,11 +35,9 @@ class SourceSelection(CachedIntegrator):
     """The cache is looked at directly, and its noise with it."""
 
     def transport(self, scene, prepared, spp):
-        return Transport(
-            prepared.cache.patches,
-            self.object_ids(scene),
-            cache=prepared.cache,
+        return self.transport_from(
+            scene,
+            prepared,
             gather_depth=0,
-            shadow_samples=self.shadow_samples,
             hide_emitters=self.hide_emitters,
         )

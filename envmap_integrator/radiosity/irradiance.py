@@ -16,7 +16,7 @@ import numpy as np
 
 from ..jit import mix, upload
 from ..progress import stage
-from ..rendering.ray_counts import Ray, count
+from .direct_light import finite, sample_irradiance
 from .patch_points import PatchPoints
 from .patches import Patches
 from .surface_points import SurfacePoints
@@ -55,6 +55,7 @@ def solve_irradiance(
     transport: Transport,
     points: SurfacePoints,
     patch_of_point: np.ndarray,
+    cell_of_point: np.ndarray,
     samples: int,
     seed: int = 0,
 ) -> IrradianceCache:
@@ -66,12 +67,13 @@ def solve_irradiance(
     end in patch j, the solution fulfils E_i = mean(π b + w E(j)), where E(j) is E_d + E_i or E_i.
     """
     members = PatchPoints(points, patch_of_point, transport.patches.count)
+    cells = upload(mi.UInt32, cell_of_point[members.index[members.first[:-1]]])
     n_patches, launch = len(members.patches), max(MAX_LANES // samples, 1)
     parts = []
     with stage("Gathering irradiance", total=n_patches) as advance:
         for begin in range(0, n_patches, launch):
             end = min(begin + launch, n_patches)
-            parts.append(_gather(scene, transport, members, begin, end, samples, seed + 1 + begin))
+            parts.append(_gather(scene, transport, members, cells, begin, end, samples, seed))
             advance(end - begin)
     if not parts:  # Nothing but mirrors and glass.
         n_channels = len(mi.Spectrum())
@@ -84,7 +86,7 @@ def solve_irradiance(
     return IrradianceCache(transport.patches, table)
 
 
-def _gather(scene, transport, members, begin, end, samples, seed):
+def _gather(scene, transport, members, cells, begin, end, samples, seed):
     """Trace the gather rays of the ``begin``-th … ``end``-th patch.
 
     Returns direct irradiance and π b per patch, throughput and row per ray.
@@ -93,11 +95,13 @@ def _gather(scene, transport, members, begin, end, samples, seed):
 
     n_lanes = (end - begin) * samples
     sampler = mi.load_dict({"type": "independent"})
+    seed += 1 + begin
     sampler.seed(seed, n_lanes)
     lane = dr.arange(mi.UInt32, n_lanes)
     rank = lane >> dr.opaque(mi.UInt32, int(np.log2(samples)))
+    member = dr.opaque(mi.UInt32, begin) + rank
     k = lane & (dr.opaque(mi.UInt32, samples) - 1)
-    si = members.sample(dr.opaque(mi.UInt32, begin) + rank, sampler.next_1d())
+    si = members.sample(member, sampler.next_1d())
 
     # ---- Low-discrepancy numbers, rotated at random for each patch (Cranley-Patterson) ----
     u = _rotated(mi.Float(k) / dr.opaque(mi.Float, samples), mi.radical_inverse_2(k, 0), rank, seed)
@@ -109,7 +113,9 @@ def _gather(scene, transport, members, begin, end, samples, seed):
     direction = si.to_world(wo)
 
     # ---- Direct light, by shadow rays and by the gather rays that hit a source ----
-    ds, light = sample_irradiance(scene, si, v)
+    sources = transport.sources
+    source_row = sources.row(dr.gather(mi.UInt32, cells, member), True)
+    ds, light = sample_irradiance(scene, sources, si, source_row, v)
     cosine = dr.maximum(dr.dot(si.sh_frame.n, ds.d), 0)
     direct = light * dr.select(ds.delta, 1, mis_weight(ds.pdf, cosine * dr.inv_pi))
 
@@ -117,6 +123,7 @@ def _gather(scene, transport, members, begin, end, samples, seed):
         ray=si.spawn_ray(direction),
         depth=mi.UInt32(1),
         origin=mi.Interaction3f(si),
+        source_row=source_row,
         pdf=pdf,
         specular=mi.Bool(False),
         bounded=mi.Bool(False),
@@ -149,24 +156,11 @@ def _rotated(x, y, rank, seed) -> mi.Point2f:
     return point - dr.floor(point)
 
 
-def sample_irradiance(scene, si, u):
-    """One sample of the irradiance [W/m²] from sources at a point: ``(ds, irradiance)``."""
-    ds, em_weight = scene.sample_emitter_direction(si, u, True)
-    count(Ray.SHADOW, ds, ds.pdf != 0)
-    cosine = dr.maximum(dr.dot(si.sh_frame.n, ds.d), 0)
-    return ds, em_weight * dr.select(dr.dot(si.n, ds.d) > 0, cosine, 0)
-
-
 def _concatenate(parts):
     """One array of scalars or spectra in place of several."""
     if dr.depth_v(parts[0]) == 1:
         return dr.concat(parts)
     return type(parts[0])(*(dr.concat(components) for components in zip(*parts, strict=True)))
-
-
-def finite(x):
-    """Zero in place of infinities and NaN, which degenerate geometry may bring."""
-    return dr.select(dr.isfinite(x), x, 0)
 
 
 def _solve(n_patches, patch, direct, escaped, weight, row, samples):

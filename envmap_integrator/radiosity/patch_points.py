@@ -15,7 +15,8 @@ class PatchPoints:
 
     patches   [K]      indices of the patches that have points
     first     [K + 1]  where the points of each begin
-    points             the points, sorted
+    index              which points stand for patches, sorted
+    points             these points
 
     Where walks from the sensors have come to a patch, only their points stand for it: global lines
     also hit what no light reaches, such as the floor under a cupboard, which would darken the part
@@ -31,6 +32,7 @@ class PatchPoints:
         order = order[np.argsort(patch_of_point[order], kind="stable")]
         self.patches, first = np.unique(patch_of_point[order], return_index=True)
         self.first = np.append(first, len(order)).astype(np.uint32)
+        self.index = order
         self.points = points.take(order)
         self._first = upload(mi.UInt32, self.first)
         self._position = upload(mi.Float, self.points.position)

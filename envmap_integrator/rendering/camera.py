@@ -56,13 +56,16 @@ def split(scene, transport, sampler, ray, active, secondary_samples):
     hit = active & si.is_valid()
     bsdf = si.bsdf(ray)
     smooth = hit & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-    cube = None
+    cube, mapped = None, smooth
+    if dr.hint(transport.far_field is not None and transport.far_field.map_mirrors, mode="scalar"):
+        mapped = hit
+    object_id = transport.object_ids(si)
+    cell, _, found = transport.patches.find_cell(si.p, facing(si, ray), object_id, mapped)
     if dr.hint(transport.far_field is not None, mode="scalar"):
-        object_id = transport.object_ids(si)
-        mapped = smooth | (hit & transport.far_field.map_mirrors)
-        cell, _, found = transport.patches.find_cell(si.p, facing(si, ray), object_id, mapped)
         cube = transport.far_field.cube(cell, si.p, found)
-    vertex = Vertex(si, bsdf, mi.Bool(False), cube, mi.Float(1))
+    sources = transport.sources
+    source_row = sources.row(cell, found)
+    vertex = Vertex(si, bsdf, sources, source_row, mi.Bool(False), cube, mi.Float(1))
 
     emitted = si.emitter(scene).eval(si, active & (not transport.hide_emitters))
     n_shadow = transport.shadow_samples
@@ -103,6 +106,7 @@ def secondary(scene, transport, sampler, vertex, u, active):
         ray=si.spawn_ray(si.to_world(bs.wo)),
         depth=dr.select(specular, mi.UInt32(0), mi.UInt32(1)),
         origin=mi.Interaction3f(si),
+        source_row=vertex.source_row,
         pdf=bs.pdf,
         specular=specular,
         bounded=mi.Bool(False),

@@ -28,6 +28,7 @@ from ..radiosity.irradiance import IrradianceCache
 from ..radiosity.patches import Patches
 from ..radiosity.surface_points import ObjectIds
 from .ray_counts import Ray, count, count_secondary
+from .source_choice import SourceChoice
 
 #: Directions sampled more densely than this [1/sr] belong to a lobe for which a Lambertian
 #: stand-in would misplace the light: they are traced on instead of read from the cache.
@@ -71,6 +72,7 @@ class Transport:
 
     patches          the coarse mesh
     object_ids       dense ids of the shapes of the scene at hand
+    sources          how shadow rays choose a source
     far_field        maps of the clusters, or None to trace every ray in full
     gather_depth     non-specular bounces before the cache may end the path
     shadow_samples   shadow rays at a camera hit; further on it's one
@@ -84,6 +86,7 @@ class Transport:
 
     patches: Patches
     object_ids: ObjectIds
+    sources: SourceChoice
     far_field: FarField | None = None
     gather_depth: int = 1
     shadow_samples: int = 1
@@ -101,6 +104,7 @@ class PathState:
     ray             its first ray
     depth           non-specular bounces behind it
     origin          the vertex it comes from, for the MIS weight of the sources it hits
+    source_row      of the choice among sources there
     pdf, specular   density [1/sr] with which the direction was sampled; no density if specular
     bounded         whether ``ray.maxt`` ends it at the cube of ``cluster``
     reach           distance [world units] up to which the ray counts the sources that it hits;
@@ -111,6 +115,7 @@ class PathState:
     ray: mi.Ray3f
     depth: mi.UInt32
     origin: mi.Interaction3f
+    source_row: mi.UInt32
     pdf: mi.Float
     specular: mi.Bool
     bounded: mi.Bool
@@ -152,6 +157,7 @@ def camera_path(ray: mi.Ray3f) -> PathState:
         ray=ray,
         depth=mi.UInt32(0),
         origin=dr.zeros(mi.Interaction3f),
+        source_row=mi.UInt32(0),
         pdf=mi.Float(1),
         specular=mi.Bool(True),
         bounded=mi.Bool(False),
@@ -183,6 +189,7 @@ def follow(
     depth = mi.UInt32(start.depth)  # Non-specular bounces so far
     bounces = mi.UInt32(0)  # All bounces of this call
     origin = mi.Interaction3f(start.origin)  # Previous vertex,
+    source_row = mi.UInt32(start.source_row)  # ... choice among sources there,
     pdf = mi.Float(start.pdf)  # ... density of the direction sampled there,
     specular = mi.Bool(start.specular)  # ... whether sources weren't sampled for it
     bounded = mi.Bool(start.bounded)  # Does the ray end where it leaves its cube?
@@ -256,7 +263,9 @@ def follow(
         if dr.hint(not transport.emission, mode="scalar"):
             source_active &= bounces > 0
         ds = mi.DirectionSample3f(scene, si=source_si, ref=origin)
-        source_pdf = scene.pdf_emitter_direction(origin, ds, source_active & ~specular)
+        source_pdf = transport.sources.pdf_direction(
+            origin, source_row, ds, source_active & ~specular
+        )
         mis = dr.select(specular, 1, mis_weight(pdf, source_pdf))
         emitted = throughput * mis * ds.emitter.eval(source_si, source_active)
         radiance += emitted
@@ -271,7 +280,8 @@ def follow(
         if dr.hint(far_field is not None and far_field.map_mirrors, mode="scalar"):
             mapped = hit
         cell, size, found = patches.find_cell(si.p, normal, object_id, mapped)
-        deep = found & smooth & (depth >= transport.gather_depth)
+        next_source_row = transport.sources.row(cell, found)
+        deep = found & is_diffuse(bsdf) & (depth >= transport.gather_depth)
         patch, has_patch = patches.find(si.p, normal, object_id, size, deep, spare.next_2d())
         # A coarse mesh can't serve hits about as near as its patches are large (corners,
         # contacts). The threshold is random, so that no border shows.
@@ -288,7 +298,15 @@ def follow(
         if dr.hint(far_field is not None, mode="scalar"):
             cube = far_field.cube(cell, si.p, found)
         boost = dr.select(residual_here, dr.rcp(going_on), 1)
-        vertex = Vertex(si, bsdf, shadow_rays_alone, cube, dr.select(lit, boost, 1))
+        vertex = Vertex(
+            si,
+            bsdf,
+            transport.sources,
+            next_source_row,
+            shadow_rays_alone,
+            cube,
+            dr.select(lit, boost, 1),
+        )
         sampled = smooth & ~(lit & served)
         if dr.hint(transport.shadow_samples > 1, mode="scalar"):
             # Camera hits get several; further on one more sample of the pixel serves better.
@@ -296,7 +314,7 @@ def follow(
             light = sample_sources(scene, vertex, sampler, n, True, sampled)
             bs, bsdf_weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), hit)
         else:
-            ds, em_weight = scene.sample_emitter_direction(si, sampler.next_2d(), False, sampled)
+            ds, em_weight = vertex.sample_direction(sampler.next_2d(), sampled)
             bsdf_value, bsdf_pdf, bs, bsdf_weight = bsdf.eval_pdf_sample(
                 ctx, si, si.to_local(ds.d), sampler.next_1d(), sampler.next_2d(), hit
             )
@@ -313,19 +331,19 @@ def follow(
             weight[ends] = throughput * bsdf_weight
             row[ends] = cached_row
         else:
-            cached_weight = dr.select(ends, bsdf_weight, 0)
-            several = served & ~single_lobe(bsdf)
-            choice = choose_lobes(bsdf, si, sampler, several)
+            cached_weight = dr.select((served | residual_here) & wide, bsdf_weight, 0)
+            several = (served | residual_here) & ~single_lobe(bsdf)
+            choice = choose_lobes(bsdf, si, sampler, several, residual_here)
             cached_weight = dr.select(several, choice.cached, cached_weight)
             bs = dr.select(several, choice.bs, bs)
             bsdf_weight = dr.select(several, choice.weight, bsdf_weight)
             sampled_specular = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-            wide &= ~several
+            wide = dr.select(several, choice.wide, wide)
             ends = dr.select(several, dr.max(bsdf_weight) == 0, ends)
             if dr.hint(residual is not None, mode="scalar"):
+                cached_weight *= dr.select(residual_here, 1 - boost, 1)
                 residual_here &= wide
-                cached_weight = dr.select(residual_here, (1 - boost) * bsdf_weight, cached_weight)
-                bsdf_weight = dr.select(residual_here, boost * bsdf_weight, bsdf_weight)
+                bsdf_weight *= dr.select(residual_here, boost, 1)
                 # Later residuals count less by the albedo, and deserve as much less effort.
                 going_on[residual_here] = dr.clip(dr.max(bsdf_weight) / boost, 0.1, 1)
                 going_on[far_residual] = 1
@@ -347,6 +365,7 @@ def follow(
         pdf = dr.select(retrace, pdf, bs.pdf)
         specular = dr.select(retrace, specular, sampled_specular)
         origin = dr.select(retrace, origin, mi.Interaction3f(si))
+        source_row = dr.select(retrace, source_row, next_source_row)
         depth += dr.select(hit & ~sampled_specular, mi.UInt32(1), mi.UInt32(0))
         counted = retrace & ((reach < dr.inf) | far_residual)
         counted |= ~retrace & shadow_rays_alone & wide
@@ -378,17 +397,25 @@ def facing(si, ray):
 class Vertex:
     """A surface that reflects light from sources.
 
-    si, bsdf   the surface
-    alone      whether rays that wide lobes send on count no sources
-    cube       the cube that bounds secondary rays from it, or None
-    boost      factor [1] on light that wide lobes reflect
+    si, bsdf      the surface
+    sources       how shadow rays choose a source
+    source_row    ... by the row of the place
+    alone         whether rays that wide lobes send on count no sources
+    cube          the cube that bounds secondary rays from it, or None
+    boost         factor [1] on light that wide lobes reflect
     """
 
     si: mi.SurfaceInteraction3f
     bsdf: mi.BSDFPtr
+    sources: SourceChoice
+    source_row: mi.UInt32
     alone: mi.Bool
     cube: Cube | None
     boost: mi.Float
+
+    def sample_direction(self, u, active):
+        """A direction to a source: ``(ds, weight)``."""
+        return self.sources.sample_direction(self.si, self.source_row, u, active)
 
     def reflected(self, scene, ds, em_weight, bsdf_value, bsdf_pdf, active):
         """Light [W/m²/sr] reflected from a sampled direction to a source.
@@ -436,7 +463,7 @@ def sample_sources(scene, vertex, sampler, count, several, active):
 def sample_source(scene, vertex, u, active):
     """Direct light [W/m²/sr] reflected at a vertex, by one shadow ray."""
     si = vertex.si
-    ds, em_weight = scene.sample_emitter_direction(si, u, False, active)
+    ds, em_weight = vertex.sample_direction(u, active)
     wo = si.to_local(ds.d)
     bsdf_value, bsdf_pdf = vertex.bsdf.eval_pdf(mi.BSDFContext(), si, wo, active)
     return vertex.reflected(scene, ds, em_weight, bsdf_value, bsdf_pdf, active)
@@ -446,40 +473,58 @@ def sample_source(scene, vertex, u, active):
 class LobeChoice:
     """What several choices among the lobes of a surface come to.
 
-    cached   weight [1] of the wide lobes, which end in the cache
-    bs       a direction of the others
-    weight   and its weight [1], zero if none was chosen
+    cached   weight [1] of the wide lobes, for which the cache stands
+    bs       the direction to follow,
+    weight   ... its weight [1], zero if none was chosen,
+    wide     ... and whether it belongs to the wide lobes
     """
 
     cached: mi.Spectrum
     bs: mi.BSDFSample3f
     weight: mi.Spectrum
+    wide: mi.Bool
 
 
 @dr.syntax
-def choose_lobes(bsdf, si, sampler, active):
-    """Sample a material ``LOBE_CHOICES`` times, stratified over its lobes."""
+def choose_lobes(bsdf, si, sampler, active, residual):
+    """Sample a material ``LOBE_CHOICES`` times, stratified over its lobes.
+
+    One direction stands for all that the cache can't stand for. Where a ``residual`` is to be
+    estimated it may be one of a wide lobe, though less often.
+    """
     count = LOBE_CHOICES
     cached, weight = mi.Spectrum(0), mi.Spectrum(0)
     bs = dr.zeros(mi.BSDFSample3f)
-    i, n_narrow = mi.UInt32(0), mi.UInt32(0)
+    wide, i, chances = mi.Bool(False), mi.UInt32(0), mi.Float(0)
     active = mi.Bool(active)
     u = sampler.next_1d()
-    while dr.hint(active, exclude=[bsdf, si], label="Choose lobes"):
+    while dr.hint(active, exclude=[bsdf, si, residual], label="Choose lobes"):
         lobe = (mi.Float(i) + u) / count
         one, one_weight = bsdf.sample(mi.BSDFContext(), si, lobe, sampler.next_2d(), active)
         delta = mi.has_flag(one.sampled_type, mi.BSDFFlags.Delta)
-        wide = is_wide(si, one.wo, one.pdf) & ~delta
-        cached += dr.select(wide, one_weight, 0)
-        # One of the narrow ones stands for all of them.
-        narrow = ~wide & (dr.max(one_weight) > 0)
-        n_narrow[narrow] += 1
-        taken = narrow & (sampler.next_1d() * mi.Float(n_narrow) < 1)
+        one_wide = is_wide(si, one.wo, one.pdf) & ~delta
+        cached += dr.select(one_wide, one_weight, 0)
+        chance = dr.select(one_wide, dr.select(residual, mi.Float(1), 0), count - 1)
+        chance = dr.select(dr.max(one_weight) > 0, chance, 0)
+        chances += chance
+        taken = sampler.next_1d() * chances < chance
         bs = dr.select(taken, one, bs)
-        weight = dr.select(taken, one_weight, weight)
+        wide = dr.select(taken, one_wide, wide)
+        weight = dr.select(taken, one_weight / chance, weight)
         i += 1
         active &= i < count
-    return LobeChoice(cached / count, bs, weight * mi.Float(n_narrow) / count)
+    return LobeChoice(cached / count, bs, weight * chances / count, wide)
+
+
+def is_diffuse(bsdf):
+    """May the cache serve a material?
+
+    Metals and glass, however rough, reflect by where the light comes from, which the cache doesn't
+    know. In glass, a lobe chosen seldom has a low density besides, and looks wider than it is.
+    """
+    flags = bsdf.flags()
+    transmits = mi.has_flag(flags, mi.BSDFFlags.GlossyTransmission)
+    return mi.has_flag(flags, mi.BSDFFlags.DiffuseReflection) & ~transmits
 
 
 def single_lobe(bsdf):

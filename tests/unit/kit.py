@@ -10,6 +10,7 @@ import numpy as np
 from envmap_integrator.radiosity.irradiance import IrradianceCache, solve_irradiance
 from envmap_integrator.radiosity.patches import Patches, build_patches
 from envmap_integrator.radiosity.surface_points import ObjectIds, SurfacePoints, scatter_points
+from envmap_integrator.rendering.source_choice import Emitters, by_weight
 from envmap_integrator.rendering.transport import Transport
 from tests.helpers import Estimate
 
@@ -44,6 +45,7 @@ class CoarseMesh:
     points: SurfacePoints
     patches: Patches
     patch_of_point: np.ndarray
+    cell_of_point: np.ndarray
 
     @property
     def n_used(self) -> int:
@@ -63,8 +65,10 @@ class CoarseMesh:
         return patch.numpy(), size.numpy(), found.numpy()
 
     def solve(self, samples: int = 64) -> IrradianceCache:
-        transport = Transport(self.patches, self.object_ids)
-        return solve_irradiance(self.scene, transport, self.points, self.patch_of_point, samples)
+        transport = Transport(self.patches, self.object_ids, by_weight(Emitters(self.scene)))
+        return solve_irradiance(
+            self.scene, transport, self.points, self.patch_of_point, self.cell_of_point, samples
+        )
 
 
 def coarse_mesh(scene: mi.Scene, budget: int = 1024, points_per_patch: int = 128) -> CoarseMesh:
@@ -74,8 +78,8 @@ def coarse_mesh(scene: mi.Scene, budget: int = 1024, points_per_patch: int = 128
 
 def coarse_mesh_over(scene: mi.Scene, points: SurfacePoints, budget: int) -> CoarseMesh:
     object_ids = ObjectIds(scene)
-    patches, patch_of_point, _ = build_patches(points, object_ids, budget)
-    return CoarseMesh(scene, object_ids, points, patches, patch_of_point)
+    patches, patch_of_point, cell_of_point = build_patches(points, object_ids, budget)
+    return CoarseMesh(scene, object_ids, points, patches, patch_of_point, cell_of_point)
 
 
 def surface_points(position: np.ndarray, normal, object_id=0, seen=1.0) -> SurfacePoints:

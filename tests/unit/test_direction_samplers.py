@@ -20,6 +20,7 @@ from envmap_integrator.maps.cube import direction_to_face
 from envmap_integrator.radiosity import irradiance
 from envmap_integrator.radiosity.surface_points import _global_lines
 from envmap_integrator.rendering import transport
+from envmap_integrator.rendering.source_choice import Emitters, by_weight
 from tests.helpers import at, ball, grey, scaled
 from tests.unit.kit import coarse_mesh, scene_of, surface_points
 
@@ -134,10 +135,17 @@ def gathered(monkeypatch):
     coarse = coarse_mesh(scene_of(plate), budget=4096, points_per_patch=32)
     upper = coarse.points.normal @ NORMAL > 0
     patch_of_point = np.where(upper, coarse.patch_of_point, -1)
-    tools = transport.Transport(coarse.patches, coarse.object_ids)
+    sources = by_weight(Emitters(coarse.scene))
+    tools = transport.Transport(coarse.patches, coarse.object_ids, sources)
     for seed in range(16):
         irradiance.solve_irradiance(
-            coarse.scene, tools, coarse.points, patch_of_point, SAMPLES, seed << 16
+            coarse.scene,
+            tools,
+            coarse.points,
+            patch_of_point,
+            coarse.cell_of_point,
+            SAMPLES,
+            seed << 16,
         )
     d, pdf = (np.concatenate(values) for values in zip(*seen, strict=True))
     return d.reshape(-1, SAMPLES, 3), pdf.reshape(-1, SAMPLES)

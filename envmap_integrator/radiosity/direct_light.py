@@ -1,0 +1,109 @@
+"""A survey of the direct light on the patches, before anything is decided about them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..jit import upload
+from ..rendering.ray_counts import Ray, count
+from ..rendering.source_choice import Emitters, SourceChoice, alias_tables, by_weight
+from .patch_points import PatchPoints
+from .surface_points import SurfacePoints
+
+#: Shadow rays per patch.
+SAMPLES = 128
+#: Part of the shadow rays that goes to emitters regardless of what has been found of them.
+UNINFORMED = 0.1
+
+
+@dataclass(frozen=True)
+class DirectLight:
+    """Samples of the irradiance from sources at surface points of K patches, N of each.
+
+    members      the patches and their surface points
+    irradiance   [K, N]     W/m², mean of the colour channels, over the probability of the emitter
+    emitter      [K, N]     index of the emitter it came from
+    position     [K, N, 3]
+    """
+
+    members: PatchPoints
+    irradiance: np.ndarray
+    emitter: np.ndarray
+    position: np.ndarray
+
+
+def survey_direct_light(
+    scene: mi.Scene,
+    emitters: Emitters,
+    points: SurfacePoints,
+    patch_of_point: np.ndarray,
+    n_patches: int,
+    seed: int = 0,
+) -> DirectLight:
+    """Send ``SAMPLES`` shadow rays from random surface points of each patch."""
+    members = PatchPoints(points, patch_of_point, n_patches)
+    shape = (len(members.patches), SAMPLES)
+    if shape[0] == 0:
+        nothing = np.zeros(shape)
+        return DirectLight(members, nothing, nothing.astype(int), np.zeros((*shape, 3)))
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, shape[0] * SAMPLES)
+    si = members.sample(dr.arange(mi.UInt32, shape[0] * SAMPLES) // SAMPLES, sampler.next_1d())
+    choice = by_weight(emitters)
+    ds, light = sample_irradiance(scene, choice, si, mi.UInt32(0), sampler.next_2d())
+    irradiance = finite(dr.mean(light))
+    emitter = emitters.index(ds.emitter, irradiance > 0)
+    dr.eval(irradiance, emitter, si.p)
+    return DirectLight(
+        members,
+        irradiance.numpy().astype(np.float64).reshape(shape),
+        emitter.numpy().astype(np.int64).reshape(shape),
+        si.p.numpy().T.reshape(*shape, 3),
+    )
+
+
+def choose_sources(
+    emitters: Emitters, light: DirectLight, cell_of_point: np.ndarray, n_cells: int
+) -> SourceChoice:
+    """Probabilities of the emitters in each large cell, by the light found of them there.
+
+    In proportion to the root mean square: to the mean, near lamps would get too few shadow rays.
+    What doesn't shine on any patch keeps a small probability; ``sampling_weight`` scales all.
+    """
+    n, weights = emitters.count, emitters.weights
+    if n < 2:
+        return by_weight(emitters)
+    cell = cell_of_point[light.members.index[light.members.first[:-1]]]
+    slot = (cell[:, None] * n + light.emitter).ravel()
+    square = np.square(light.irradiance) * weights[light.emitter]  # They have been divided by them.
+    if not square.any():
+        return by_weight(emitters)
+    inside = (slot >= 0) & (square.ravel() > 0)
+    found = np.bincount(slot[inside], square.ravel()[inside], (n_cells + 1) * n).reshape(-1, n)
+    found[-1] = np.bincount(light.emitter.ravel(), square.ravel(), n)
+    found[found.sum(axis=1) == 0] = found[-1]
+    found = np.sqrt(found)
+    found /= found.sum(axis=1, keepdims=True)
+    probability = (1 - UNINFORMED) * found + UNINFORMED * weights
+    return SourceChoice(emitters, upload(mi.Float, alias_tables(probability)))
+
+
+def sample_irradiance(scene, choice, si, row, u):
+    """One sample of the irradiance [W/m²] from sources at a point: ``(ds, irradiance)``."""
+    ds, weight = choice.sample_direction(si, row, u, True)
+    cosine = dr.maximum(dr.dot(si.sh_frame.n, ds.d), 0)
+    light = weight * dr.select(dr.dot(si.n, ds.d) > 0, cosine, 0)
+    active = (ds.pdf != 0) & (dr.max(light) > 0)
+    ray = si.spawn_ray_to(ds.p)
+    count(Ray.SHADOW, ray, active)
+    active &= ~scene.ray_test(ray, active)
+    return ds, dr.select(active, light, 0)
+
+
+def finite(x):
+    """Zero in place of infinities and NaN, which degenerate geometry may bring."""
+    return dr.select(dr.isfinite(x), x, 0)

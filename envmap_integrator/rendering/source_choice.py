@@ -1,0 +1,122 @@
+"""Which source a shadow ray goes to, by what each is known to send to the place.
+
+The paper's source selection: with one choice for all places, most shadow rays of a room with
+several lamps are spent on those that hardly matter there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..jit import upload
+from ..scene_order import ordered_emitters
+
+#: Largest number below 1.
+ALMOST_ONE = 1 - 2**-24
+
+
+class Emitters:
+    """The emitters of a scene, as ``ordered_emitters`` counts them.
+
+    count      number of emitters L
+    pointers   [L]
+    weights    [L]  their ``sampling_weight``, in sum 1
+    """
+
+    def __init__(self, scene: mi.Scene):
+        emitters = ordered_emitters(scene)
+        self.count = len(emitters)
+        self.pointers = mi.EmitterPtr(emitters)
+        weights = np.array([emitter.sampling_weight() for emitter in emitters], dtype=np.float64)
+        self.weights = weights / max(weights.sum(), 1e-30)
+        registry_ids = dr.reinterpret_array(mi.UInt32, self.pointers).numpy()
+        table = np.zeros(int(registry_ids.max(initial=0)) + 1, dtype=np.uint32)
+        table[registry_ids] = np.arange(self.count, dtype=np.uint32)
+        self._table = upload(mi.UInt32, table)
+
+    def index(self, emitter: mi.EmitterPtr, active=True) -> mi.UInt32:
+        """Index of each emitter."""
+        return dr.gather(mi.UInt32, self._table, dr.reinterpret_array(mi.UInt32, emitter), active)
+
+
+@dataclass(frozen=True)
+class SourceChoice:
+    """Probabilities of the emitters in each large cell of the coarse mesh, and anywhere else.
+
+    emitters   the L emitters to choose from
+    table      [R * L * 4]  alias tables (Walker 1974): where the first emitter's share of a bin
+                            ends, the second emitter, and the probabilities of both; one row a
+                            large cell, the last one for all other places
+    """
+
+    emitters: Emitters
+    table: mi.Float
+
+    def row(self, cell: mi.UInt32, found: mi.Bool) -> mi.UInt32:
+        """Row of the table for places in a large cell, if they are in one."""
+        n_rows = dr.width(self.table) // (4 * max(self.emitters.count, 1))
+        last = dr.opaque(mi.UInt32, max(n_rows - 1, 0))
+        return dr.select(found, dr.minimum(cell, last), last)
+
+    def sample_direction(self, ref, row, u, active):
+        """Choose a source and a direction to it: ``(ds, weight)``, as Mitsuba's scene does.
+
+        Visibility isn't tested.
+        """
+        n = self.emitters.count
+        if n == 0:
+            return dr.zeros(mi.DirectionSample3f, dr.width(ref)), mi.Spectrum(0)
+        u = mi.Point2f(u)
+        bin_ = dr.minimum(mi.UInt32(u.x * n), n - 1)
+        u.x = u.x * n - mi.Float(bin_)
+        entry = dr.gather(mi.Vector4f, self.table, row * n + bin_, active)
+        first = u.x < entry.x
+        index = dr.select(first, bin_, mi.UInt32(entry.y))
+        probability = dr.select(first, entry.z, entry.w)
+        u.x = dr.select(first, u.x / entry.x, (u.x - entry.x) / (1 - entry.x))
+        u.x = dr.clip(u.x, 0, ALMOST_ONE)
+        emitter = dr.gather(mi.EmitterPtr, self.emitters.pointers, index, active)
+        ds, weight = emitter.sample_direction(ref, u, active)
+        ds.pdf *= probability
+        return ds, weight * dr.rcp(probability)
+
+    def pdf_direction(self, ref, row, ds, active):
+        """Density [1/sr] of ``sample_direction``."""
+        n = self.emitters.count
+        index = self.emitters.index(ds.emitter, active)
+        probability = dr.gather(mi.Float, self.table, 4 * (row * n + index) + 2, active)
+        return ds.emitter.pdf_direction(ref, ds, active) * probability
+
+
+def by_weight(emitters: Emitters) -> SourceChoice:
+    """A choice that knows nothing of places: one row."""
+    return SourceChoice(emitters, upload(mi.Float, alias_tables(emitters.weights[None])))
+
+
+def alias_tables(probability: np.ndarray) -> np.ndarray:
+    """Alias tables [R, L, 4] of discrete distributions [R, L] (``SourceChoice``)."""
+    n_rows, n = probability.shape
+    rows = np.arange(n_rows)
+    order = np.argsort(probability, axis=1)
+    share = probability * n
+    table = np.zeros((n_rows, n, 4))
+    table[..., 0], table[..., 1], table[..., 2] = 1, np.arange(n), probability
+    # Fill up the poorest bin with what the richest has too much of, which may make it the next
+    # poor one.
+    next_poor, rich = np.ones(n_rows, dtype=int), np.full(n_rows, n - 1)
+    poor = order[:, 0] if n else rows
+    for _ in range(n - 1):
+        giver = order[rows, rich]
+        table[rows, poor, 0] = np.clip(share[rows, poor], 0, 1)
+        table[rows, poor, 1] = giver
+        share[rows, giver] -= 1 - share[rows, poor]
+        became_poor = share[rows, giver] < 1
+        poor = np.where(became_poor, giver, order[rows, np.minimum(next_poor, n - 1)])
+        rich -= became_poor
+        next_poor += ~became_poor
+    table[..., 3] = np.take_along_axis(probability, table[..., 1].astype(int), axis=1)
+    return table
