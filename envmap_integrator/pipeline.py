@@ -22,6 +22,7 @@ from .radiosity.direct_light import choose_sources, survey_direct_light
 from .radiosity.evenness import drop_uneven
 from .radiosity.irradiance import IrradianceCache, solve_irradiance
 from .radiosity.patches import Patches, build_patches
+from .radiosity.spaces import find_spaces, separate
 from .radiosity.surface_points import ObjectIds, scatter_points
 from .rendering.source_choice import Emitters
 from .rendering.transport import Transport
@@ -79,6 +80,11 @@ def prepare(scene: mi.Scene, key: str, settings: Settings, baker=None) -> Prepar
             scene, object_ids, POINTS_PER_PATCH * settings.patches, settings.map_mirrors
         )
         patches, patch_of_point, cell_of_point = build_patches(points, object_ids, settings.patches)
+        space = find_spaces(scene, points, patch_of_point)
+        patches, patch_of_point, cell_of_point = separate(
+            scene, object_ids, patches, points, patch_of_point, cell_of_point, space
+        )
+
     with _timed(times, "direct light"):
         emitters = Emitters(scene)
         light = survey_direct_light(scene, emitters, points, patch_of_point, patches.count)
@@ -101,10 +107,10 @@ def prepare(scene: mi.Scene, key: str, settings: Settings, baker=None) -> Prepar
     with _timed(times, "clusters"):
         if settings.requests:
             clusters, cluster_of_point = listed_clusters(
-                points, scene, settings.requests, settings.distance_ratio
+                points, space, scene, settings.requests, settings.distance_ratio
             )
         else:
-            clusters, cluster_of_point = find_clusters(points, settings.distance_ratio)
+            clusters, cluster_of_point = find_clusters(points, space, settings.distance_ratio)
         membership = cluster_of_cell(
             len(clusters), cluster_of_point, cell_of_point, dr.width(patches.levels)
         )

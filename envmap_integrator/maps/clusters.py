@@ -55,13 +55,15 @@ class Cluster:
 
 def listed_clusters(
     points: SurfacePoints,
+    space: np.ndarray,
     scene: mi.Scene,
     requests: tuple[ClusterRequest, ...],
     distance_ratio: float,
 ) -> tuple[list[Cluster], np.ndarray]:
     """The clusters that the user listed, and the cluster of every surface point [N], -1 if none.
 
-    One whose cube holds the whole scene is left out with a warning: it has nothing to map.
+    One whose cube holds the whole scene is left out with a warning: it has nothing to map. Of
+    shapes in several spaces, only what lies in the one where most is seen belongs to it.
     Raises ``ValueError`` if a shape isn't in the scene, is listed twice or has no surface.
     """
     ids = [shape.id() for shape in ordered_shapes(scene)]
@@ -86,6 +88,8 @@ def listed_clusters(
             raise ValueError(
                 f"{owner}: no surface was found on {_some(request.shape_ids)}; is it empty?"
             )
+        if (space[member] >= 0).any():
+            member &= space == np.bincount(space[member & (space >= 0)]).argmax()
         ratio = request.distance_ratio or distance_ratio
         cluster = _cluster(request.name, points.position[member], ratio)
         if _holds(cluster, points):
@@ -100,27 +104,29 @@ def listed_clusters(
     return clusters, cluster_of_point
 
 
-def find_clusters(points: SurfacePoints, distance_ratio: float) -> tuple[list[Cluster], np.ndarray]:
-    """Group the contents of the scene, as far as its sensors see them, into clusters.
+def find_clusters(
+    points: SurfacePoints, space: np.ndarray, distance_ratio: float
+) -> tuple[list[Cluster], np.ndarray]:
+    """Group the contents of each space, as far as the scene's sensors see them, into clusters.
 
     Returns the clusters and the cluster of every surface point [N], -1 if it belongs to none.
     """
     cluster_of_point = np.full(len(points), -1)
-    if points.seen.sum() == 0:
+    if not points.seen.any():
         return [], cluster_of_point
     _, extent = points.bounds()
-    contents = np.flatnonzero(~_on_large_plane(points, extent))
+    contents = np.flatnonzero((space >= 0) & ~_on_large_plane(points, extent))
     if len(contents) == 0:
         return [], cluster_of_point
 
     # ---- Voxels of what isn't surroundings ----
     cell = np.floor(points.position[contents] / (VOXEL * extent))
-    _, voxel = np.unique(_joined(cell.T), return_inverse=True)
-    seen = np.bincount(voxel, weights=points.seen[contents])
+    _, voxel = np.unique(_joined((*cell.T, space[contents])), return_inverse=True)
+    seen = np.bincount(voxel, weights=points.seen[contents] > 0)
     n_points = np.bincount(voxel)
-    centre = np.stack(
-        [np.bincount(voxel, weights=points.position[contents, i]) / n_points for i in range(3)], 1
-    )
+    # Too far apart for a group along a fourth axis if in several spaces.
+    place = *points.position[contents].T, space[contents] * extent
+    centre = np.stack([np.bincount(voxel, weights=x) / n_points for x in place], axis=1)
     kept = np.flatnonzero(seen > 0)
     kept = kept[np.argsort(-seen[kept], kind="stable")][:MAX_VOXELS]
     if len(kept) == 0:
@@ -130,7 +136,7 @@ def find_clusters(points: SurfacePoints, distance_ratio: float) -> tuple[list[Cl
     group = np.ones(1, dtype=int)
     if len(kept) > 1:
         group = fcluster(linkage(centre[kept], "complete"), DIAMETER * extent, "distance")
-    share = np.bincount(group, weights=seen[kept]) / points.seen.sum()
+    share = np.bincount(group, weights=seen[kept]) / (points.seen > 0).sum()
     best = [g for g in np.argsort(-share, kind="stable") if share[g] >= MIN_SEEN][:MAX_CLUSTERS]
 
     clusters = []
@@ -148,14 +154,14 @@ def cluster_of_cell(
 ) -> np.ndarray:
     """Cluster of every large cell of the coarse mesh, ``n_clusters`` where it belongs to none.
 
-    A cell belongs to the cluster that most of its surface points belong to; slots of the table
-    without a cell count for nothing.
+    A cell belongs to the cluster that most of its surface points belong to, if there are any.
     """
     votes = np.zeros((n_cells, n_clusters + 1), dtype=np.int64)
     known = cell_of_point >= 0
     np.add.at(votes, (cell_of_point[known], cluster_of_point[known]), 1)
     # No cluster is -1, the last column, which ``argmax`` finds as ``n_clusters``.
-    return votes.argmax(axis=1).astype(np.uint32)
+    membership = np.where(votes.any(axis=1), votes.argmax(axis=1), n_clusters)
+    return membership.astype(np.uint32)
 
 
 def _on_large_plane(points: SurfacePoints, extent: float) -> np.ndarray:

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-import mitsuba as mi
 import numpy as np
 
-from ..jit import upload
 from .direct_light import DirectLight
-from .patches import Patches
+from .patches import Patches, drop
 
 #: Slices of a patch along each axis that are compared.
 SLICES = 4
@@ -48,11 +44,9 @@ def drop_uneven(
         certain = (np.abs(part - mean[:, None]) > doubt) & (n * lit[:, None] >= MIN_LIT)
         uneven |= (contrast & certain).any(axis=1)
 
-    dropped = light.members.patches[uneven]
-    cells = patches.cells.numpy()
-    cells[dropped] = 0
-    kept = ~np.isin(patch_of_point, dropped)
-    return replace(patches, cells=upload(mi.UInt32, cells)), np.where(kept, patch_of_point, -1)
+    dropped = np.zeros(patches.count, dtype=bool)
+    dropped[light.members.patches[uneven]] = True
+    return drop(patches, patch_of_point, dropped)
 
 
 def _statistics(values: np.ndarray, group: np.ndarray, n_groups: int) -> tuple[np.ndarray, ...]:

@@ -17,18 +17,10 @@ class PatchPoints:
     first     [K + 1]  where the points of each begin
     index              which points stand for patches, sorted
     points             these points
-
-    Where walks from the sensors have come to a patch, only their points stand for it: global lines
-    also hit what no light reaches, such as the floor under a cupboard, which would darken the part
-    of the patch that looks out.
     """
 
     def __init__(self, points: SurfacePoints, patch_of_point: np.ndarray, n_patches: int):
-        has_patch = patch_of_point >= 0
-        visited = np.zeros(n_patches, dtype=bool)
-        visited[patch_of_point[has_patch & (points.seen > 0)]] = True
-        chosen = has_patch & ((points.seen > 0) | ~visited[patch_of_point])
-        order = np.flatnonzero(chosen)
+        order = standing_points(points, patch_of_point)
         order = order[np.argsort(patch_of_point[order], kind="stable")]
         self.patches, first = np.unique(patch_of_point[order], return_index=True)
         self.first = np.append(first, len(order)).astype(np.uint32)
@@ -50,3 +42,16 @@ class PatchPoints:
         si.sh_frame = mi.Frame3f(dr.gather(mi.Normal3f, self._shading_normal, index))
         si.t = 0
         return si
+
+
+def standing_points(points: SurfacePoints, patch_of_point: np.ndarray) -> np.ndarray:
+    """Indices of the points that stand for patches.
+
+    Where walks from the sensors have come to a patch, only their points stand for it: global lines
+    also hit what no light reaches, such as the floor under a cupboard, which would darken the part
+    of the patch that looks out.
+    """
+    has_patch, seen = patch_of_point >= 0, points.seen > 0
+    visited = np.zeros(patch_of_point.max(initial=-1) + 2, dtype=bool)
+    visited[patch_of_point[has_patch & seen]] = True
+    return np.flatnonzero(has_patch & (seen | ~visited[patch_of_point]))

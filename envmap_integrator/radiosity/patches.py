@@ -191,6 +191,18 @@ def build_patches(
     return patches, patch_of_cell[cell_of_point], large_of_point
 
 
+def drop(
+    patches: Patches, patch_of_point: np.ndarray, dropped: np.ndarray
+) -> tuple[Patches, np.ndarray]:
+    """Leave out some patches [P]: paths that come there are traced on.
+
+    Returns the remaining patches and the patch of every surface point [N], -1 where it has none.
+    """
+    cells = np.where(dropped, 0, patches.cells.numpy())
+    kept = (patch_of_point >= 0) & ~dropped[patch_of_point]
+    return replace(patches, cells=upload(mi.UInt32, cells)), np.where(kept, patch_of_point, -1)
+
+
 def _no_patches() -> Patches:
     """A coarse mesh on which nothing is found."""
     bucket = dr.zeros(mi.UInt32, BUCKET)

@@ -30,7 +30,7 @@ class SurfacePoints:
     normal          [N, 3]  geometric normal, facing the side the point belongs to
     shading_normal  [N, 3]  shading normal, on the same side
     object_id       [N]     dense index of the top-level shape (``ObjectIds``)
-    seen            [N]     1 for a point on a walk from a sensor, 0 on a global line
+    seen            [N]     1 + the sensor's index for a point on a walk from it, 0 on a global line
     """
 
     position: np.ndarray
@@ -111,12 +111,12 @@ def scatter_points(
                 sampler.seed(1009 * seed_ + index + 1, n_walks)
                 ray = _sensor_rays(sensor, sampler)
                 walks += _hits_along(
-                    scene, object_ids, sampler, ray, WALK_HITS, wanted, bounce=True
+                    scene, object_ids, sampler, ray, WALK_HITS, wanted, walk=index + 1
                 )
         if sum(map(len, lines)) < (count // 2 if sensors else count):
             sampler.seed(1009 * seed_, n_lines)
             ray = _global_lines(scene, sampler)
-            lines += _hits_along(scene, object_ids, sampler, ray, LINE_HITS, wanted, bounce=False)
+            lines += _hits_along(scene, object_ids, sampler, ray, LINE_HITS, wanted)
     return SurfacePoints.concatenate(walks + lines)
 
 
@@ -143,9 +143,9 @@ def _hits_along(
     ray: mi.Ray3f,
     n_hits: int,
     wanted: mi.BSDFFlags,
-    bounce: bool,
+    walk: int = 0,
 ) -> list[SurfacePoints]:
-    """Follow rays over ``n_hits`` hits, bouncing off surfaces or passing straight through them.
+    """Follow rays over ``n_hits`` hits, on a walk of a sensor or straight through surfaces.
 
     Points are kept where the BSDF has any of the ``wanted`` flags.
     """
@@ -169,7 +169,7 @@ def _hits_along(
         objects = object_ids(si)
 
         direction = ray.d
-        if bounce:
+        if walk:
             bs, weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), active)
             direction = si.to_world(bs.wo)
             active &= mi.luminance(weight) > 0 if len(weight) == 3 else weight[0] > 0
@@ -183,7 +183,7 @@ def _hits_along(
                 normal.numpy().T[index],
                 shading_normal.numpy().T[index],
                 objects.numpy()[index],
-                np.full(int(index.sum()), float(bounce), dtype=np.float32),
+                np.full(int(index.sum()), float(walk), dtype=np.float32),
             )
         )
     return parts

@@ -35,6 +35,14 @@ def globe(centre, object_id: int, radius: float = 1.0, seen=1.0) -> SurfacePoint
     return surface_points(centre + radius * normal, normal, object_id, seen)
 
 
+def single_space(points: SurfacePoints) -> np.ndarray:
+    return np.zeros(len(points), dtype=np.int64)
+
+
+def found(points: SurfacePoints, distance_ratio: float = RATIO):
+    return find_clusters(points, single_space(points), distance_ratio)
+
+
 def hall(**more) -> SurfacePoints:
     """Two globes far apart over a large floor."""
     return SurfacePoints.concatenate(
@@ -47,7 +55,7 @@ def hall(**more) -> SurfacePoints:
 
 def test_objects_far_apart_are_clusters_and_the_floor_is_none():
     points = hall()
-    clusters, cluster_of_point = find_clusters(points, RATIO)
+    clusters, cluster_of_point = found(points)
     assert len(clusters) == 2
     assert (cluster_of_point[points.object_id == 0] == -1).all()
     for object_id, centre in ((1, LEFT), (2, RIGHT)):
@@ -60,7 +68,7 @@ def test_objects_far_apart_are_clusters_and_the_floor_is_none():
 
 def test_cubes_hold_their_cluster():
     points = hall()
-    clusters, cluster_of_point = find_clusters(points, 1.0)
+    clusters, cluster_of_point = found(points, 1.0)
     assert clusters
     for index, cluster in enumerate(clusters):
         offset = np.abs(points.position[cluster_of_point == index] - cluster.centre).max()
@@ -68,16 +76,33 @@ def test_cubes_hold_their_cluster():
 
 
 def test_what_no_sensor_sees_gets_no_map():
-    assert find_clusters(hall(seen=0.0), RATIO)[0] == []
+    assert found(hall(seen=0.0))[0] == []
+
+
+def test_what_lies_in_several_spaces_is_no_cluster():
+    points = hall()
+    space = np.where(points.position[:, 0] < LEFT[0], 0, 1)
+    clusters, cluster_of_point = find_clusters(points, space, RATIO)
+    assert len(clusters) == 3
+    for index in range(3):
+        assert len(set(space[cluster_of_point == index])) == 1
+
+
+def test_what_is_in_no_known_space_is_no_cluster():
+    points = hall()
+    space = np.where(points.object_id == 1, -1, 0)
+    clusters, cluster_of_point = find_clusters(points, space, RATIO)
+    assert len(clusters) == 1
+    assert set(cluster_of_point[points.object_id == 1]) == {-1}
 
 
 def test_a_floor_alone_has_no_cluster():
-    clusters, cluster_of_point = find_clusters(floor(), RATIO)
+    clusters, cluster_of_point = found(floor())
     assert clusters == [] and (cluster_of_point == -1).all()
 
 
 def test_a_cube_that_holds_the_whole_scene_is_no_cluster():
-    clusters, cluster_of_point = find_clusters(globe(LEFT, 0), distance_ratio=20)
+    clusters, cluster_of_point = found(globe(LEFT, 0), distance_ratio=20)
     assert clusters == [] and (cluster_of_point == -1).all()
 
 
@@ -91,7 +116,7 @@ def test_clusters_depend_neither_on_scale_nor_on_place(scale, shift):
         points.object_id,
         points.seen,
     )
-    here, there = find_clusters(points, RATIO)[0], find_clusters(moved, RATIO)[0]
+    here, there = found(points)[0], found(moved)[0]
     assert len(here) == len(there)
     radii = sorted(cluster.radius * scale for cluster in here)
     assert sorted(cluster.radius for cluster in there) == pytest.approx(radii, rel=0.02)
@@ -107,8 +132,9 @@ def scene(variant) -> mi.Scene:
     return mi.load_dict({"type": "scene"} | {name: ball(0, 0, 0, 1) for name in names})
 
 
-def listed(scene, *requests: ClusterRequest):
-    return listed_clusters(hall(), scene, requests, RATIO)
+def listed(scene, *requests: ClusterRequest, points: SurfacePoints | None = None):
+    points = points or hall()
+    return listed_clusters(points, single_space(points), scene, requests, RATIO)
 
 
 def test_listed_shapes_make_clusters(scene):
@@ -148,22 +174,33 @@ def test_wrong_requests_are_named(scene, requests, message):
         listed(scene, *requests)
 
 
+def test_of_a_listed_shape_what_lies_in_another_space_is_left_out(scene):
+    points = hall()
+    space = np.where(points.position[:, 0] < LEFT[0] - 0.5, 0, 1)
+    both = (ClusterRequest("globes", ("left", "right"), 1.2),)
+    _, cluster_of_point = listed_clusters(points, space, scene, both, RATIO)
+    member = (points.object_id > 0) & (space == 1)
+    assert np.array_equal(cluster_of_point, np.where(member, 0, -1))
+
+
 def test_a_shape_without_surface_is_named(scene):
     with pytest.raises(ValueError, match='mipmap_cube "desk": no surface was found on "right"'):
-        listed_clusters(floor(), scene, (ClusterRequest("desk", ("right",), None),), RATIO)
+        listed(scene, ClusterRequest("desk", ("right",), None), points=floor())
 
 
 def test_long_lists_of_shapes_are_cut():
     scene = scene_of(*(ball(i, 0, 0, 0.1) for i in range(20)))
     with pytest.raises(ValueError, match=r'"shape7", … \(20 in all\)'):
-        listed_clusters(floor(), scene, (ClusterRequest("desk", ("cup",), None),), RATIO)
+        listed(scene, ClusterRequest("desk", ("cup",), None), points=floor())
 
 
 # ---------------------- Cells of the coarse mesh ----------------------
 
 
 def test_cells_take_the_cluster_of_most_of_their_points():
-    """A cell of two clusters, one of one, one of none, one half of none; a point without a cell."""
+    """A cell of two clusters, one of one, one of none, one half of none, one without points; a
+    point without a cell.
+    """
     cluster_of_point = np.array([0, 1, 1, 0, 0, -1, -1, -1, 0, 1])
     cell_of_point = np.array([0, 0, 0, 1, 1, 2, 3, 3, 3, -1])
-    assert cluster_of_cell(2, cluster_of_point, cell_of_point, 4).tolist() == [1, 0, 2, 2]
+    assert cluster_of_cell(2, cluster_of_point, cell_of_point, 5).tolist() == [1, 0, 2, 2, 2]
