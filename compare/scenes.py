@@ -89,11 +89,38 @@ class Subject:
         """How tables and plots call it."""
         return self.label or self.integrator
 
+    @classmethod
+    def parse(cls, text: str) -> Subject:
+        """As on the command line: ``one_level_path`` or ``one_level_path:patches=4096,…``.
+
+        Raises ``ValueError`` for anything else.
+        """
+        integrator, _, listed = text.partition(":")
+        settings = {}
+        for setting in filter(None, listed.split(",")):
+            name, equals, value = setting.partition("=")
+            if not (name and equals and value):
+                raise ValueError(f'"{text}": give settings as {integrator}:name=value,name=value')
+            settings[name] = _value(value)
+        return cls(integrator, settings, text if settings else "")
+
     def make(self, hide_emitters: bool = False) -> mi.Integrator:
         """A new integrator: nothing is prepared yet."""
         return mi.load_dict(
             {"type": self.integrator, "hide_emitters": hide_emitters, **self.settings}
         )
+
+
+def _value(text: str) -> bool | int | float | str:
+    """The value of a setting."""
+    if text in ("true", "false"):
+        return text == "true"
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
 
 
 PATH = Subject("path")

@@ -27,13 +27,18 @@ class Options(JudgedOptions):
     """See ``--help``."""
 
     spp: int = option("samples per pixel", 64, 16)
-    integrators: tuple[str, ...] = option("plugins to compare with path", ("envmap_hybrid",))
+    integrators: tuple[str, ...] = option(
+        "plugins to compare with path, with settings perhaps: NAME:parameter=value,…",
+        ("envmap_hybrid",),
+    )
     equal: str = option("what path is given as much of as the first integrator: spp or time", "spp")
 
     def __post_init__(self):
         super().__post_init__()
         if self.equal not in ("spp", "time"):
             raise ValueError(f'--equal must be "spp" or "time", got "{self.equal}"')
+        for integrator in self.integrators:
+            Subject.parse(integrator)
 
 
 def run(options: Options, folder: Path, scenes: tuple[Path, ...] = SCENES) -> Iterator[Report]:
@@ -44,7 +49,8 @@ def run(options: Options, folder: Path, scenes: tuple[Path, ...] = SCENES) -> It
 
 def _compare(view: View, options: Options, folder: Path) -> Report:
     scene, hidden = view.load(), view.hides_emitters()
-    subjects = [Subject(name) for name in dict.fromkeys(options.integrators) if name != "path"]
+    named = dict.fromkeys(options.integrators)
+    subjects = [Subject.parse(name) for name in named if name != "path"]
     tasks = [Task(scene, subject, options.spp) for subject in subjects]
     spp = options.spp
     if options.equal == "time" and tasks:

@@ -267,3 +267,19 @@ def test_settings_reach_the_integrator():
     subject = Subject("one_level_path", {"shadow_samples": 3}, label="three")
     assert subject.name == "three"
     assert "shadow_samples = 3" in str(subject.make())
+
+
+def test_subjects_are_named_with_their_settings():
+    assert Subject.parse("path") == PATH
+    text = "envmap_hybrid:residual_probability=0.5,patches=4096,lookup=plain,hide_emitters=true"
+    subject = Subject.parse(text)
+    assert subject.name == text
+    assert subject.settings == {
+        "residual_probability": 0.5, "patches": 4096, "lookup": "plain", "hide_emitters": True,
+    }  # fmt: skip
+    assert "residual_probability = 0.5" in str(subject.make())
+
+
+def test_settings_without_a_value(capsys):
+    assert main(["render", "--quick", "--integrators", "envmap_hybrid:patches"]) == 2
+    assert "give settings as envmap_hybrid:name=value" in capsys.readouterr().err
