@@ -239,13 +239,14 @@ class Comparison:
         return f"{self.bias:+.2%} ± {self.margin:.2%}"
 
 
-def compare(scene, ours, regions, spp, sensor=0) -> list[Comparison]:
-    """Compare regions [R, pixels] of a sensor's picture."""
+def compare(scene, ours, regions, spp, sensor=0, brightest=np.inf) -> list[Comparison]:
+    """Compare regions [R, pixels] of a sensor's picture, no pixel above ``brightest``."""
 
     def means(integrator, first_seed):
         seeds = range(first_seed, first_seed + SEEDS)
         pictures = np.stack([picture(scene, integrator, spp, seed, sensor) for seed in seeds])
         pixels = pictures.mean(axis=-1, dtype=np.float64).reshape(SEEDS, -1)
+        pixels = np.minimum(pixels, brightest)
         return [pixels[:, region].mean(axis=1) for region in regions]
 
     path = mi.load_dict({"type": "path"})
@@ -296,6 +297,9 @@ def test_room(material, part, record_property):
 #: Adds light by itself: Mitsuba puts the coat on top without dimming what is below.
 GAINS = ("principled-clearcoat",)
 EPSILON = 0.005
+#: In a furnace all is 1. Samples of rough glass may weigh thousands, with ``path`` as with ours:
+#: what a mirror beside it makes of one in a million would drown what is measured.
+BRIGHTEST = 2.0
 
 
 @cache
@@ -314,7 +318,7 @@ def in_furnace() -> dict[tuple[str, str], Comparison]:
         | balls(bsdfs, places)
     )
     regions = [seen(scene, f"{part}{i}") for i in range(len(bsdfs)) for part in PARTS]
-    results = compare(scene, mi.load_dict({"type": "envmap_hybrid"}), regions, SPP)
+    results = compare(scene, mi.load_dict({"type": "envmap_hybrid"}), regions, SPP, 0, BRIGHTEST)
     return dict(zip(product(MATERIALS, PARTS), results, strict=True))
 
 
