@@ -23,7 +23,8 @@ from compare.runs import Measurements, Task, equal_time_spp, interleave, render
 from compare.scenes import PAPER_CLUSTER, PAPER_ROOM, PATH, Subject, View
 from envmap_integrator.rendering.ray_counts import count_rays
 
-RADIOSITY, MAPS = ("coarse mesh", "irradiance cache"), ("clusters", "maps")
+RADIOSITY = ("coarse mesh", "direct light", "irradiance cache")
+MAPS = ("clusters", "maps")
 """Stages of the pre-passes that make up the passes of Table 3."""
 
 SECONDARY = ("secondary", "unbounded")
