@@ -65,7 +65,8 @@ def split(scene, transport, sampler, ray, active, secondary_samples):
         cube = transport.far_field.cube(cell, si.p, found)
     sources = transport.sources
     source_row = sources.row(cell, found)
-    vertex = Vertex(si, bsdf, sources, source_row, mi.Bool(False), cube, mi.Float(1))
+    no = mi.Bool(False)
+    vertex = Vertex(si, bsdf, sources, source_row, no, no, cube, mi.Float(1))
 
     emitted = si.emitter(scene).eval(si, active & (not transport.hide_emitters))
     n_shadow = transport.shadow_samples

@@ -287,8 +287,8 @@ def follow(
         # contacts). The threshold is random, so that no border shows.
         near = (bounces > 0) & (dr.norm(si.p - origin.p) < size * (0.5 + spare.next_1d()))
         served = has_patch & ~near
-        # Total irradiance stands for direct light too, but not where that may shine.
-        lit = served & (depth > 0) & only_wide(bsdf)
+        # Total irradiance stands for direct light too: single shadow rays beside a lamp are noisy.
+        lit = served & (depth > 0)
         if dr.hint(transport.shadow_rays, mode="scalar"):
             lit = mi.Bool(False)
         residual_here = served & goes_on
@@ -303,11 +303,12 @@ def follow(
             bsdf,
             transport.sources,
             next_source_row,
+            lit & served,
             shadow_rays_alone,
             cube,
             dr.select(lit, boost, 1),
         )
-        sampled = smooth & ~(lit & served)
+        sampled = smooth & ~(lit & served & only_wide(bsdf))
         if dr.hint(transport.shadow_samples > 1, mode="scalar"):
             # Camera hits get several; further on one more sample of the pixel serves better.
             n = dr.select(depth == 0, mi.UInt32(transport.shadow_samples), mi.UInt32(1))
@@ -400,6 +401,7 @@ class Vertex:
     si, bsdf      the surface
     sources       how shadow rays choose a source
     source_row    ... by the row of the place
+    lit           whether the cache alone brings direct light to wide lobes
     alone         whether rays that wide lobes send on count no sources
     cube          the cube that bounds secondary rays from it, or None
     boost         factor [1] on light that wide lobes reflect
@@ -409,6 +411,7 @@ class Vertex:
     bsdf: mi.BSDFPtr
     sources: SourceChoice
     source_row: mi.UInt32
+    lit: mi.Bool
     alone: mi.Bool
     cube: Cube | None
     boost: mi.Float
@@ -420,8 +423,8 @@ class Vertex:
     def reflected(self, scene, ds, em_weight, bsdf_value, bsdf_pdf, active):
         """Light [W/m²/sr] reflected from a sampled direction to a source.
 
-        For wide lobes, shadow rays alone bring light from beyond the cube, and all of it where the
-        cache ends the path.
+        To wide lobes, shadow rays alone bring light from beyond the cube, and all of it where the
+        cache ends the path with indirect light, none where with direct light too.
         """
         wide = is_wide(self.si, self.si.to_local(ds.d), bsdf_pdf)
         alone = wide & self.alone
@@ -433,7 +436,7 @@ class Vertex:
             )
         mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, dr.select(alone, 0, bsdf_pdf)))
         light = bsdf_value * em_weight * mis * dr.select(wide, self.boost, 1)
-        active = active & (ds.pdf != 0) & (dr.max(light) > 0)
+        active = active & (ds.pdf != 0) & ~(wide & self.lit) & (dr.max(light) > 0)
         ray = self.si.spawn_ray_to(ds.p)
         count(Ray.SHADOW, ray, active)
         active &= ~scene.ray_test(ray, active)
