@@ -143,3 +143,21 @@ def test_sampling_weights_count():
     assert (x == 0).mean() == pytest.approx(0.75, abs=0.03)
     assert not (x == -1).any()
     assert np.isfinite(weight.numpy()).all()
+
+
+def test_a_scene_without_emitters_has_nothing_to_choose():
+    scene = scene_of({"type": "sphere"})
+    si = dr.zeros(mi.SurfaceInteraction3f, 4)
+    ds, weight = by_weight(Emitters(scene)).sample_direction(
+        si, mi.UInt32(0), mi.Point2f(0.5), True
+    )
+    assert np.all(ds.pdf.numpy() == 0) and np.all(weight.numpy() == 0)
+
+
+def test_the_largest_random_number_is_in_the_last_bin():
+    table = upload(mi.Float, alias_tables(np.array([[0.5, 0.5]])))
+    scene = scene_of(lamp_at(-1), lamp_at(1))
+    si = dr.zeros(mi.SurfaceInteraction3f, 1)
+    u = mi.Point2f(1 - 2**-24, 0.5)
+    ds, _ = SourceChoice(Emitters(scene), table).sample_direction(si, mi.UInt32(0), u, True)
+    assert np.isfinite(ds.p.numpy()).all()
