@@ -25,15 +25,19 @@ class DirectLight:
     """Samples of the irradiance from sources at surface points of K patches, N of each.
 
     members      the patches and their surface points
-    irradiance   [K, N]     W/m², mean of the colour channels, over the probability of the emitter
-    emitter      [K, N]     index of the emitter it came from
-    position     [K, N, 3]
+    irradiance   [K * N]  W/m², mean of the colour channels, over the probability of the emitter
+    emitter      [K * N]  index of the emitter it came from
+    position     [K * N]
     """
 
     members: PatchPoints
-    irradiance: np.ndarray
-    emitter: np.ndarray
-    position: np.ndarray
+    irradiance: mi.Float
+    emitter: mi.UInt32
+    position: mi.Point3f
+
+    def __len__(self) -> int:
+        """Number K of patches."""
+        return len(self.members.patches)
 
 
 def survey_direct_light(
@@ -46,24 +50,18 @@ def survey_direct_light(
 ) -> DirectLight:
     """Send ``SAMPLES`` shadow rays from random surface points of each patch."""
     members = PatchPoints(points, patch_of_point, n_patches)
-    shape = (len(members.patches), SAMPLES)
-    if shape[0] == 0:
-        nothing = np.zeros(shape)
-        return DirectLight(members, nothing, nothing.astype(int), np.zeros((*shape, 3)))
+    n = len(members.patches) * SAMPLES
+    if n == 0:
+        return DirectLight(members, mi.Float(), mi.UInt32(), mi.Point3f())
     sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(seed, shape[0] * SAMPLES)
-    si = members.sample(dr.arange(mi.UInt32, shape[0] * SAMPLES) // SAMPLES, sampler.next_1d())
+    sampler.seed(seed, n)
+    si = members.sample(dr.arange(mi.UInt32, n) // SAMPLES, sampler.next_1d())
     choice = by_weight(emitters)
     ds, light = sample_irradiance(scene, choice, si, mi.UInt32(0), sampler.next_2d())
     irradiance = finite(dr.mean(light))
     emitter = emitters.index(ds.emitter, irradiance > 0)
     dr.eval(irradiance, emitter, si.p)
-    return DirectLight(
-        members,
-        irradiance.numpy().astype(np.float64).reshape(shape),
-        emitter.numpy().astype(np.int64).reshape(shape),
-        si.p.numpy().T.reshape(*shape, 3),
-    )
+    return DirectLight(members, irradiance, emitter, si.p)
 
 
 def choose_sources(
@@ -78,13 +76,15 @@ def choose_sources(
     if n < 2:
         return by_weight(emitters)
     cell = cell_of_point[light.members.index[light.members.first[:-1]]]
-    slot = (cell[:, None] * n + light.emitter).ravel()
-    square = np.square(light.irradiance) * weights[light.emitter]  # They have been divided by them.
+    emitter = light.emitter.numpy().astype(np.int64)
+    # The irradiance has been divided by the weights.
+    square = np.square(light.irradiance.numpy().astype(np.float64)) * weights[emitter]
     if not square.any():
         return by_weight(emitters)
-    inside = (slot >= 0) & (square.ravel() > 0)
-    found = np.bincount(slot[inside], square.ravel()[inside], (n_cells + 1) * n).reshape(-1, n)
-    found[-1] = np.bincount(light.emitter.ravel(), square.ravel(), n)
+    slot = np.repeat(cell, SAMPLES) * n + emitter
+    inside = (slot >= 0) & (square > 0)
+    found = np.bincount(slot[inside], square[inside], (n_cells + 1) * n).reshape(-1, n)
+    found[-1] = np.bincount(emitter, square, n)
     found[found.sum(axis=1) == 0] = found[-1]
     found = np.sqrt(found)
     found /= found.sum(axis=1, keepdims=True)
