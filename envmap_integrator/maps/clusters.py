@@ -114,7 +114,7 @@ def find_clusters(
     cluster_of_point = np.full(len(points), -1)
     if not points.seen.any():
         return [], cluster_of_point
-    _, extent = points.bounds()
+    extent = points.extent
     contents = np.flatnonzero((space >= 0) & ~_on_large_plane(points, extent))
     if len(contents) == 0:
         return [], cluster_of_point
@@ -200,7 +200,7 @@ def _cluster(name: str, position: np.ndarray, distance_ratio: float) -> Cluster:
 
 def _holds(cluster: Cluster, points: SurfacePoints) -> bool:
     """Does the cube hold the whole scene, so that nothing is left for a map?"""
-    low, high = points.position.min(axis=0), points.position.max(axis=0)
+    low, high = points.box
     inside = (cluster.centre - cluster.half_width <= low) & (
         cluster.centre + cluster.half_width >= high
     )

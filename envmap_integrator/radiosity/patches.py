@@ -153,7 +153,7 @@ def build_patches(
     if len(points) == 0:  # Nothing but mirrors and glass.
         empty = np.zeros(0, dtype=np.int64)
         return _no_patches(), empty, empty
-    low, extent = points.bounds()
+    (low, _), extent = points.box, points.extent
     position = upload_vectors(mi.Point3f, points.position)
     normal = upload_vectors(mi.Normal3f, points.normal)
     object_id = upload(mi.UInt32, points.object_id)

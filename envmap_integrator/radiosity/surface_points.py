@@ -7,6 +7,7 @@ curves. The cost doesn't depend on the number of triangles.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -42,12 +43,22 @@ class SurfacePoints:
     def __len__(self) -> int:
         return len(self.position)
 
-    def bounds(self) -> tuple[np.ndarray, float]:
-        """Lowest corner [3] of all points, and the diagonal of the box that holds most of them."""
+    @cached_property
+    def box(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest corner [3] of all points."""
+        low_high = np.zeros((2, 3), self.position.dtype)
+        if len(self):
+            axes = np.ascontiguousarray(self.position.T)  # Ten times as fast in NumPy.
+            low_high[:] = axes.min(axis=1), axes.max(axis=1)
+        return low_high[0], low_high[1]
+
+    @cached_property
+    def extent(self) -> float:
+        """Diagonal of the box that holds most points."""
         if len(self) == 0:
-            return np.zeros(3), 1.0
-        low, high = np.percentile(self.position, [2, 98], axis=0)
-        return self.position.min(axis=0), max(float(np.linalg.norm(high - low)), 1e-30)
+            return 1.0
+        low, high = np.percentile(np.ascontiguousarray(self.position.T), [2, 98], axis=1)
+        return max(float(np.linalg.norm(high - low)), 1e-30)
 
     def take(self, index: np.ndarray) -> SurfacePoints:
         """The points of the given indices, in that order."""
