@@ -121,13 +121,13 @@ def scatter_points(
             for index, sensor in enumerate(sensors):
                 sampler.seed(1009 * seed_ + index + 1, n_walks)
                 ray = _sensor_rays(sensor, sampler)
-                walks += _hits_along(
-                    scene, object_ids, sampler, ray, WALK_HITS, wanted, walk=index + 1
+                walks.append(
+                    _hits_along(scene, object_ids, sampler, ray, WALK_HITS, wanted, index + 1)
                 )
         if sum(map(len, lines)) < (count // 2 if sensors else count):
             sampler.seed(1009 * seed_, n_lines)
             ray = _global_lines(scene, sampler)
-            lines += _hits_along(scene, object_ids, sampler, ray, LINE_HITS, wanted)
+            lines.append(_hits_along(scene, object_ids, sampler, ray, LINE_HITS, wanted))
     return SurfacePoints.concatenate(walks + lines)
 
 
@@ -147,6 +147,7 @@ def _global_lines(scene: mi.Scene, sampler: mi.Sampler) -> mi.Ray3f:
     return mi.Ray3f(mi.Point3f(sphere.center) + sphere.radius * offset, direction)
 
 
+@dr.syntax
 def _hits_along(
     scene: mi.Scene,
     object_ids: ObjectIds,
@@ -155,17 +156,25 @@ def _hits_along(
     n_hits: int,
     wanted: mi.BSDFFlags,
     walk: int = 0,
-) -> list[SurfacePoints]:
+) -> SurfacePoints:
     """Follow rays over ``n_hits`` hits, on a walk of a sensor or straight through surfaces.
 
     Points are kept where the BSDF has any of the ``wanted`` flags.
     """
-    ctx = mi.BSDFContext()
-    active = dr.full(mi.Bool, True, dr.width(ray))
-    parts = []
-    for _ in range(n_hits):
-        sampler.schedule_state()
-        dr.make_opaque(ray, active)  # One kernel for all hits: nothing is a literal in the first.
+    n_rays = dr.width(ray)
+    size = n_hits * n_rays
+    positions, normals, shading_normals = (dr.zeros(mi.Float, 3 * size) for _ in range(3))
+    object_of_point, kept = dr.zeros(mi.UInt32, size), dr.zeros(mi.Bool, size)
+    n_hits_, n_rays_ = dr.opaque(mi.UInt32, n_hits), dr.opaque(mi.UInt32, n_rays)
+
+    ray = mi.Ray3f(ray)
+    index = dr.arange(mi.UInt32, n_rays)
+    active = dr.full(mi.Bool, True, n_rays)
+    while dr.hint(
+        active,
+        exclude=[positions, normals, shading_normals, object_of_point, kept],
+        label="Scatter points",
+    ):
         count(Ray.SURVEY, ray, active)
         si = scene.ray_intersect(ray, active)
         active &= si.is_valid()
@@ -177,24 +186,33 @@ def _hits_along(
         keep = active & ((bsdf.flags() & int(wanted)) != 0)
         keep &= dr.all(dr.isfinite(si.p)) & dr.all(dr.isfinite(shading_normal))
         keep &= dr.squared_norm(normal) > 0.5
-        objects = object_ids(si)
+        dr.scatter(positions, si.p, index, keep)
+        dr.scatter(normals, normal, index, keep)
+        dr.scatter(shading_normals, shading_normal, index, keep)
+        dr.scatter(object_of_point, object_ids(si), index, keep)
+        dr.scatter(kept, mi.Bool(True), index, keep)
 
         direction = ray.d
-        if walk:
-            bs, weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), active)
+        if dr.hint(walk > 0, mode="scalar"):
+            bs, weight = bsdf.sample(
+                mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active
+            )
             direction = si.to_world(bs.wo)
             active &= mi.luminance(weight) > 0 if len(weight) == 3 else weight[0] > 0
         ray = si.spawn_ray(direction)
-        dr.eval(si.p, normal, shading_normal, objects, keep, ray, active)
+        index += n_rays_
+        active &= index < n_hits_ * n_rays_
 
-        index = keep.numpy()
-        parts.append(
-            SurfacePoints(
-                si.p.numpy().T[index],
-                normal.numpy().T[index],
-                shading_normal.numpy().T[index],
-                objects.numpy()[index],
-                np.full(int(index.sum()), float(walk), dtype=np.float32),
-            )
-        )
-    return parts
+    dr.eval(positions, normals, shading_normals, object_of_point, kept)
+    chosen = np.flatnonzero(kept.numpy())
+    position, normal, shading_normal = (
+        vectors.numpy().reshape(size, 3)[chosen]
+        for vectors in (positions, normals, shading_normals)
+    )
+    return SurfacePoints(
+        position,
+        normal,
+        shading_normal,
+        object_of_point.numpy()[chosen],
+        np.full(len(chosen), float(walk), dtype=np.float32),
+    )
