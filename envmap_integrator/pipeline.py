@@ -116,17 +116,8 @@ def prepare(scene: mi.Scene, key: str, settings: Settings, baker=None) -> Prepar
         )
 
     with _timed(times, "maps"):
-        maps = tuple(
-            baker.bake(
-                scene,
-                prepared,
-                cluster,
-                points.take(np.flatnonzero(cluster_of_point == index)),
-                settings.map_resolution,
-                seed=index + 1,
-            )
-            for index, cluster in enumerate(clusters)
-        )
+        members = [points.take(np.flatnonzero(cluster_of_point == i)) for i in range(len(clusters))]
+        maps = baker.bake(scene, prepared, clusters, members, settings.map_resolution)
     return replace(prepared, maps=maps, cluster_of_cell=membership)
 
 

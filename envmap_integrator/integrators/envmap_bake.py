@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..maps.bake import bake_map
+from ..maps.bake import bake_maps
 from ..maps.cube_map import CubeMap
 from ..parameters import Parameters
 from .common import CachedIntegrator
@@ -67,8 +67,8 @@ class EnvmapBake(CachedIntegrator):
         radiance, distance, valid = self.radiance(scene, self.prepare(scene), sampler, ray, active)
         return radiance, valid, [dr.select(valid, distance, 0)]
 
-    def bake(self, scene, prepared, cluster, points, resolution, seed) -> CubeMap:
-        """Bake the map of a cluster whose surface points are ``points``.
+    def bake(self, scene, prepared, clusters, points, resolution) -> tuple[CubeMap, ...]:
+        """Bake the maps of clusters whose surface points are ``points``, one record each.
 
         ``prepared`` needs no more than the irradiance cache.
         """
@@ -76,4 +76,6 @@ class EnvmapBake(CachedIntegrator):
         def radiance_distance(sampler, ray, active):
             return self.radiance(scene, prepared, sampler, ray, active)[:2]
 
-        return bake_map(scene, radiance_distance, cluster, points, resolution, self.samples, seed)
+        return bake_maps(
+            scene, radiance_distance, clusters, points, resolution, self.samples, seed=1
+        )

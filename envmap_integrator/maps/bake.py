@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..jit import opaque_point, upload
+from ..jit import upload
 from ..progress import stage
 from ..radiosity.surface_points import SurfacePoints
 from ..rendering.ray_counts import Ray, count
@@ -21,35 +21,37 @@ MAX_LANES = 1 << 22
 MASKED = 1e-15
 
 
-def bake_map(
+def bake_maps(
     scene: mi.Scene,
     radiance_distance,
-    cluster: Cluster,
-    points: SurfacePoints,
+    clusters: list[Cluster],
+    points: list[SurfacePoints],
     resolution: int,
     samples: int,
     seed: int,
-) -> CubeMap:
-    """Bake the map of one cluster.
+) -> tuple[CubeMap, ...]:
+    """Bake the maps of clusters, all at once.
 
     ``radiance_distance(sampler, ray, active)`` gives radiance along rays and the distance to what
-    they hit; ``points`` are the surface points of the cluster. Rays go out from the centre but
+    they hit; ``points`` are the surface points of each cluster. Rays go out from the centre but
     start on the cube. Where a start lies behind geometry, no ray of the cluster ever leaves there:
     such texels, recognised because no point of the cluster sees the start, are masked and filled
     before mip-mapping. ``samples`` rays per texel, a power of two.
     """
-    n_channels = len(mi.Spectrum())
-    n_texels = 6 * resolution**2
-    half_width = dr.opaque(mi.Float, cluster.half_width)
-    centre = opaque_point(cluster.centre)
+    if not clusters:
+        return ()
+    n_texels = len(clusters) * 6 * resolution**2
+    centres = upload(mi.Float, np.stack([cluster.centre for cluster in clusters]))
+    half_widths = upload(mi.Float, np.array([cluster.half_width for cluster in clusters]))
+    members = SurfacePoints.concatenate(points)
+    first = upload(mi.UInt32, np.cumsum([0, *map(len, points)]))
+    position, normals = upload(mi.Float, members.position), upload(mi.Float, members.normal)
     resolution_ = dr.opaque(mi.UInt32, resolution)
-    position = upload(mi.Float, points.position)
-    normals = upload(mi.Float, points.normal)
-    n_points = dr.opaque(mi.UInt32, len(points))
+    n_pixels = resolution_ * resolution_
 
     launch = max(MAX_LANES // samples, 1)
-    sums = []
-    with stage(f"Baking {cluster.name}", total=n_texels) as advance:
+    totals = np.empty((n_texels, len(mi.Spectrum()) + 2), np.float32)
+    with stage("Baking maps", total=n_texels) as advance:
         for begin in range(0, n_texels, launch):
             end = min(begin + launch, n_texels)
             sampler = mi.load_dict({"type": "independent"})
@@ -60,22 +62,26 @@ def bake_map(
             )
 
             # ---- Direction through the texel ----
-            pixels = resolution_ * resolution_
             face, y, x = (
-                index // pixels,
+                index // n_pixels,
                 (index // resolution_) % resolution_,
                 index % resolution_,
             )
+            cluster, face = face // 6, face % 6
             u = mi.Point2f(mi.Float(x), mi.Float(y)) + sampler.next_2d()
             d = dr.normalize(face_to_direction(face, 2 * u / mi.Float(resolution_) - 1))
+            centre = dr.gather(mi.Point3f, centres, cluster)
+            half_width = dr.gather(mi.Float, half_widths, cluster)
             start = exit_distance(centre, half_width, centre, d)
             o = centre + start * d
 
             # ---- Can a ray from the cluster get there? ----
+            first_point = dr.gather(mi.UInt32, first, cluster)
+            n_points = dr.gather(mi.UInt32, first, cluster + 1) - first_point
             k = dr.minimum(mi.UInt32(sampler.next_1d() * mi.Float(n_points)), n_points - 1)
             si = dr.zeros(mi.SurfaceInteraction3f, len(lane))
-            si.p = dr.gather(mi.Point3f, position, k)
-            si.n = dr.gather(mi.Normal3f, normals, k)
+            si.p = dr.gather(mi.Point3f, position, first_point + k)
+            si.n = dr.gather(mi.Normal3f, normals, first_point + k)
             reached = dr.dot(o - si.p, si.n) > 0
             ray = si.spawn_ray_to(o)
             ray.maxt = dr.norm(o - ray.o)  # No shorter: the start may lie just behind a wall.
@@ -89,13 +95,21 @@ def bake_map(
             dr.eval(value)  # Once: each block sum would trace all rays anew.
             total = [dr.block_sum(c, samples) for c in value]
             dr.eval(total)
-            sums.append(np.stack([t.numpy() for t in total], axis=-1))
+            totals[begin:end] = np.stack([t.numpy() for t in total], axis=-1)
             advance(end - begin)
 
-    total = np.concatenate(sums).reshape(6, resolution, resolution, n_channels + 2)
+    shape = 6, resolution, resolution, totals.shape[1]
+    return tuple(
+        CubeMap(cluster, _levels(total.reshape(shape), samples))
+        for cluster, total in zip(clusters, np.split(totals, len(clusters)), strict=True)
+    )
+
+
+def _levels(total: np.ndarray, samples: int) -> list[np.ndarray]:
+    """All levels of a map from the sums [6, R, R, C + 2] over the rays that arrived, and these."""
     weight = total[..., -1]
     value = total[..., :-1] / np.maximum(weight, 1)[..., None]
     levels = build_levels(value.astype(np.float64), weight / samples)
     masked = weight == 0
     levels[0][masked, -1] = -np.maximum(levels[0][masked, -1], MASKED)
-    return CubeMap(cluster, [level.astype(np.float32) for level in levels])
+    return [level.astype(np.float32) for level in levels]

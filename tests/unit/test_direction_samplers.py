@@ -14,7 +14,7 @@ import pytest
 from scipy import stats
 
 from envmap_integrator.jit import SpareNumbers
-from envmap_integrator.maps.bake import bake_map
+from envmap_integrator.maps.bake import bake_maps
 from envmap_integrator.maps.clusters import Cluster
 from envmap_integrator.maps.cube import direction_to_face
 from envmap_integrator.radiosity import irradiance
@@ -191,7 +191,8 @@ def test_bake_rays_fill_texels_evenly():
         return mi.Spectrum(1), mi.Float(1)
 
     point = surface_points(CENTRE[None] + [0, 0, 0.5], [0, 0, 1])
-    bake_map(scene_of(ball(0, 0, 9, 1)), record, cluster, point, resolution, samples, seed=5)
+    scene = scene_of(ball(0, 0, 9, 1))
+    bake_maps(scene, record, [cluster], [point], resolution, samples, seed=5)
     o, d = (np.concatenate(values) for values in zip(*rays, strict=True))
     np.testing.assert_allclose(np.linalg.norm(d, axis=1), 1, rtol=1e-5)
     along = (o - CENTRE) / np.linalg.norm(o - CENTRE, axis=1, keepdims=True)
