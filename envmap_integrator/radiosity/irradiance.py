@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 #: Relative change of the irradiance at which the solution counts as converged.
 TOLERANCE = 1e-5
 MAX_ITERATIONS = 256
+#: Iterations between tests of that: each makes the host wait.
+CHECK_EVERY = 4
 #: Steps of the R2 sequence (Roberts 2018).
 R2 = (0.7548776662466927, 0.5698402909980532)
 #: Gather rays per kernel launch: bounds memory.
@@ -175,15 +177,17 @@ def _solve(n_patches, patch, direct, escaped, weight, row, samples):
 
     indirect = mi.Float(escaped)
     with stage("Solving irradiance"):
-        for _ in range(MAX_ITERATIONS):
+        for iteration in range(MAX_ITERATIONS):
             store(indirect)
             arriving = weight * dr.gather(mi.Spectrum, table, row)
+            dr.eval(arriving)  # Once, not for every block sum.
             arriving = mi.Spectrum(*(dr.block_sum(c, samples) / samples for c in arriving))
-            updated = escaped + dr.ravel(arriving)
-            change = dr.sum(dr.abs(updated - indirect))
-            level = dr.sum(direct + updated)
-            dr.eval(updated, change, level)
-            indirect = updated
+            previous, indirect = indirect, escaped + dr.ravel(arriving)
+            if iteration % CHECK_EVERY:
+                continue
+            change = dr.sum(dr.abs(indirect - previous))
+            level = dr.sum(direct + indirect)
+            dr.eval(indirect, change, level)
             if change[0] <= TOLERANCE * level[0]:
                 break
     store(indirect)

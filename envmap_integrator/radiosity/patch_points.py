@@ -22,7 +22,9 @@ class PatchPoints:
     def __init__(self, points: SurfacePoints, patch_of_point: np.ndarray, n_patches: int):
         order = standing_points(points, patch_of_point)
         order = order[np.argsort(patch_of_point[order], kind="stable")]
-        self.patches, first = np.unique(patch_of_point[order], return_index=True)
+        patch = patch_of_point[order]
+        first = np.flatnonzero(np.diff(patch, prepend=-1))
+        self.patches = patch[first]
         self.first = np.append(first, len(order)).astype(np.uint32)
         self.index = order
         self.points = points.take(order)
