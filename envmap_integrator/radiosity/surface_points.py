@@ -19,8 +19,6 @@ from ..scene_order import ordered_shapes
 
 #: Hits followed along each global line, and along each walk from a sensor.
 LINE_HITS, WALK_HITS = 8, 4
-#: Share of the points asked for that is enough: few rays miss, which isn't worth another batch.
-ENOUGH = 0.75
 #: Batches of rays cast at most to find as many points as asked for.
 MAX_BATCHES = 8
 
@@ -119,14 +117,14 @@ def scatter_points(
     for batch in range(MAX_BATCHES):
         # Rays miss open scenes and leave them early: go on until there are enough hits.
         seed_ = MAX_BATCHES * seed + batch
-        if sum(map(len, walks)) < ENOUGH * count / 2:
+        if sum(map(len, walks)) < count // 2:
             for index, sensor in enumerate(sensors):
                 sampler.seed(1009 * seed_ + index + 1, n_walks)
                 ray = _sensor_rays(sensor, sampler)
                 walks.append(
                     _hits_along(scene, object_ids, sampler, ray, WALK_HITS, wanted, index + 1)
                 )
-        if sum(map(len, lines)) < ENOUGH * (count / 2 if sensors else count):
+        if sum(map(len, lines)) < (count // 2 if sensors else count):
             sampler.seed(1009 * seed_, n_lines)
             ray = _global_lines(scene, sampler)
             lines.append(_hits_along(scene, object_ids, sampler, ray, LINE_HITS, wanted))
