@@ -104,6 +104,7 @@ def subject(lookup: str, resolution: int, ratio: float, options: Options) -> Sub
     settings = {
         "lookup": lookup,
         "mirrors": "map",
+        "irradiance_filter": False,
         "map_resolution": resolution,
         "distance_ratio": ratio,
         "patches": options.patches,

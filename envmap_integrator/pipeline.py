@@ -16,6 +16,7 @@ from .maps.clusters import (
     cluster_of_cell,
     find_clusters,
     listed_clusters,
+    worthwhile,
 )
 from .maps.cube_map import CubeMap, from_parts, to_parts
 from .radiosity.direct_light import choose_sources, survey_direct_light
@@ -43,6 +44,7 @@ class Settings:
     map_samples: int = 0
     distance_ratio: float = 0.0
     map_mirrors: bool = False
+    map_always: bool = False
     requests: tuple[ClusterRequest, ...] = ()
 
 
@@ -92,7 +94,7 @@ def prepare(scene: mi.Scene, key: str, settings: Settings, baker=None) -> Prepar
         patches, patch_of_point = drop_uneven(light, patches, patch_of_point)
 
     with _timed(times, "irradiance cache"):
-        cache = solve_irradiance(
+        cache, escaped_share = solve_irradiance(
             scene,
             Transport(patches, object_ids, sources),
             points,
@@ -111,6 +113,9 @@ def prepare(scene: mi.Scene, key: str, settings: Settings, baker=None) -> Prepar
             )
         else:
             clusters, cluster_of_point = find_clusters(points, space, settings.distance_ratio)
+            share = np.where(patch_of_point >= 0, escaped_share[patch_of_point], 0)
+            if not (settings.map_always or worthwhile(points, cluster_of_point, share)):
+                clusters, cluster_of_point = [], np.full(len(points), -1)
         membership = cluster_of_cell(
             len(clusters), cluster_of_point, cell_of_point, dr.width(patches.levels)
         )

@@ -127,9 +127,18 @@ def load_scene(path: Path, width: int, height: int, **parameters: Any) -> mi.Sce
 
 
 def integrator(kind: str, **settings: Any) -> mi.Integrator:
-    """One of ours on a small budget, or one of Mitsuba's."""
-    ours = kind in ("envmap_hybrid", "one_level_path", "source_selection", "envmap_bake")
-    return mi.load_dict({"type": kind} | ({"patches": PATCHES} if ours else {}) | settings)
+    """One of ours on a small budget, or one of Mitsuba's.
+
+    Ours make all maps, and pixels share nothing: they are independent of each other.
+    """
+    own: Description = {}
+    if kind in ("envmap_hybrid", "one_level_path", "source_selection", "envmap_bake"):
+        own = {"patches": PATCHES, "sampler": "scene"}
+    if kind in ("envmap_hybrid", "one_level_path"):
+        own["irradiance_filter"] = False
+    if kind == "envmap_hybrid":
+        own["maps"] = "always"
+    return mi.load_dict({"type": kind} | own | settings)
 
 
 # ---------------------- Pictures and statistics ----------------------

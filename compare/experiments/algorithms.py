@@ -136,9 +136,12 @@ def run(options: Options, folder: Path) -> Iterator[Report]:
 
 
 def _paper_subjects(options: Options) -> list[Subject]:
-    """The paper's algorithms with its numbers of rays; look-ups are ours."""
+    """The paper's algorithms with its numbers of rays; look-ups are ours. No pixels share light."""
     shadow = _cache(options) | {"shadow_samples": options.shadow_samples}
-    both: dict[str, Any] = shadow | {"secondary_samples": options.secondary_samples}
+    both: dict[str, Any] = shadow | {
+        "secondary_samples": options.secondary_samples,
+        "irradiance_filter": False,
+    }
     return [
         Subject("envmap_hybrid", both | {"table": PAPER_CLUSTER}),
         Subject("source_selection", shadow),

@@ -10,9 +10,13 @@ from ..fingerprint import SceneFingerprint
 from ..parameters import Parameters
 from ..pipeline import Prepared, Settings, load, prepare
 from ..radiosity.surface_points import ObjectIds
-from ..rendering.camera import camera_radiance
+from ..rendering.camera import CameraSample, camera_radiance
+from ..rendering.film import expose, expose_filtered, pixel_sampler
 from ..rendering.source_choice import Emitters, SourceChoice
 from ..rendering.transport import Residual, Transport
+
+#: Mitsuba's samplers, and that of the scene.
+SAMPLERS = ("multijitter", "independent", "stratified", "ldsampler", "orthogonal", "scene")
 
 
 class CachedIntegrator(mi.SamplingIntegrator):
@@ -37,6 +41,8 @@ class CachedIntegrator(mi.SamplingIntegrator):
         self.shadow_samples = parameters.integer("shadow_samples", 1, 1, 1 << 16)
         self.secondary_samples = 1
         self.residual_probability = 0.0
+        self.irradiance_filter = False
+        self.sampler = parameters.choice("sampler", "multijitter", SAMPLERS)
         self.cache_file = parameters.text("cache_file")
         self._fingerprint = SceneFingerprint()
         self._prepared: Prepared | None = None
@@ -120,16 +126,35 @@ class CachedIntegrator(mi.SamplingIntegrator):
             sensor = scene.sensors()[sensor]
         prepared = self.prepare(scene)
         self._seed = seed
+        film = sensor.film()
         with dr.suspend_grad():
+            sampler = pixel_sampler(sensor, self.sampler, spp)
             # What kernels read is put in place before the first one is recorded.
-            self.transport(scene, prepared, spp or sensor.sampler().sample_count())
-            return super().render(scene, sensor, seed, spp, develop, evaluate)
+            self.transport(scene, prepared, sampler.sample_count())
+
+            def shade(sampler, ray):
+                return self.radiance(scene, prepared, sampler, ray, True)
+
+            if self.irradiance_filter and self.residual_probability == 0:
+                n_samples = sampler.sample_count() * self.secondary_samples
+                expose_filtered(sensor, sampler, seed, shade, n_samples)
+            else:
+                expose(sensor, sampler, seed, shade, self.aov_names(), self.aovs)
+            picture = film.develop() if develop else mi.TensorXf()
+            if evaluate:
+                film.schedule_storage()
+                dr.eval(picture)
+        return picture
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
-        radiance, _, valid = self.radiance(scene, self.prepare(scene), sampler, ray, active)
-        return radiance, valid, []
+        found = self.radiance(scene, self.prepare(scene), sampler, ray, active)
+        return found.radiance, found.valid, self.aovs(found)
 
-    def radiance(self, scene, prepared, sampler, ray, active):
+    def aovs(self, found: CameraSample) -> list[mi.Float]:
+        """Values of ``aov_names``."""
+        return []
+
+    def radiance(self, scene, prepared, sampler, ray, active) -> CameraSample:
         """As ``camera_radiance``, from a prepared state that need hold no more than the cache."""
         return camera_radiance(
             scene,

@@ -38,6 +38,10 @@ class EnvmapBake(CachedIntegrator):
      * - shadow_samples
        - |int|
        - Shadow rays where a bake ray hits. (Default: 1)
+     * - sampler
+       - |string|
+       - One of Mitsuba's samplers, whatever the scene names, or ``scene`` for the scene's. Those
+         that stratify may round the samples per pixel up. (Default: multijitter)
      * - cache_file
        - |string|
        - File with the baked state, from :monosp:`envmap-render bake`; unused when nested. (Default:
@@ -63,9 +67,8 @@ class EnvmapBake(CachedIntegrator):
     def aov_names(self):
         return ["distance"]
 
-    def sample(self, scene, sampler, ray, medium=None, active=True):
-        radiance, distance, valid = self.radiance(scene, self.prepare(scene), sampler, ray, active)
-        return radiance, valid, [dr.select(valid, distance, 0)]
+    def aovs(self, found):
+        return [dr.select(found.valid, found.distance, 0)]
 
     def bake(self, scene, prepared, clusters, points, resolution) -> tuple[CubeMap, ...]:
         """Bake the maps of clusters whose surface points are ``points``, one record each.
@@ -74,7 +77,8 @@ class EnvmapBake(CachedIntegrator):
         """
 
         def radiance_distance(sampler, ray, active):
-            return self.radiance(scene, prepared, sampler, ray, active)[:2]
+            found = self.radiance(scene, prepared, sampler, ray, active)
+            return found.radiance, found.distance
 
         return bake_maps(
             scene, radiance_distance, clusters, points, resolution, self.samples, seed=1

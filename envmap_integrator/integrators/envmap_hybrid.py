@@ -20,9 +20,10 @@ class EnvmapHybrid(CachedIntegrator):
     density of the samples asks for. What they hit inside is shaded from the irradiance cache. Light
     sources are reached by shadow rays (Reinhard, Tijssen and Jansen 1994).
 
-    Without any parameter, clusters are found automatically. Nested emitters
-    :monosp:`mipmap_cube` with ``shapes`` list them instead; a nested :monosp:`envmap_bake` sets how
-    maps are baked.
+    Without any parameter, clusters are found automatically, and get maps if these are predicted to
+    spare more than they cost; without maps, this is :monosp:`one_level_path`. Nested emitters
+    :monosp:`mipmap_cube` with ``shapes`` list clusters instead, which get maps in any case; a
+    nested :monosp:`envmap_bake` sets how maps are baked.
 
     .. pluginparameters::
 
@@ -54,6 +55,10 @@ class EnvmapHybrid(CachedIntegrator):
        - |string|
        - ``trace`` follows mirrors and narrow lobes in full; ``map`` looks them up like all
          else. (Default: trace)
+     * - maps
+       - |string|
+       - ``auto`` makes maps of automatic clusters if they are predicted to pay, ``always`` in any
+         case. (Default: auto)
      * - map_resolution
        - |int|
        - Texels along the edge of a map's face, a power of two up to 2048. (Default: 64)
@@ -69,6 +74,14 @@ class EnvmapHybrid(CachedIntegrator):
        - Probability of tracing on where the cache or a map could end a path, to correct what they
          get wrong. Above 0 the mean is that of :monosp:`path`: there is no bias, but more
          noise. (Default: 0)
+     * - irradiance_filter
+       - |bool|
+       - Let neighbouring pixels share the indirect light that diffuse surfaces gather, where it
+         can't differ by much. Off where ``residual_probability`` is above 0. (Default: true)
+     * - sampler
+       - |string|
+       - One of Mitsuba's samplers, whatever the scene names, or ``scene`` for the scene's. Those
+         that stratify may round the samples per pixel up. (Default: multijitter)
      * - cache_file
        - |string|
        - File with the baked state, from :monosp:`envmap-render bake`. (Default: none, bake now)
@@ -102,10 +115,12 @@ class EnvmapHybrid(CachedIntegrator):
         parameters = Parameters(props)
         self.secondary_samples = parameters.integer("secondary_samples", 1, 1, 1 << 16)
         self.residual_probability = parameters.number("residual_probability", 0.0, 0.0, 1.0)
+        self.irradiance_filter = parameters.flag("irradiance_filter", True)
         self.gather_depth = parameters.integer("gather_depth", 1, 1, 64)
         self.second_hit = parameters.choice("second_hit", "cache", ("cache", "shadow_rays"))
         self.lookup = parameters.choice("lookup", "corrected", ("corrected", "plain"))
         self.mirrors = parameters.choice("mirrors", "trace", ("trace", "map"))
+        self.maps = parameters.choice("maps", "auto", ("auto", "always"))
         self.map_resolution = parameters.power_of_two("map_resolution", 64, 1, 2048)
         self.distance_ratio = parameters.number("distance_ratio", 2.0, 1.0)
         self.mip_bias = parameters.number("mip_bias", -2.0, -32.0, 32.0)
@@ -133,6 +148,7 @@ class EnvmapHybrid(CachedIntegrator):
             map_samples=self.baker.samples,
             distance_ratio=self.distance_ratio,
             map_mirrors=self.mirrors == "map",
+            map_always=self.maps == "always" or self.mirrors == "map",
             requests=self.requests,
         )
 

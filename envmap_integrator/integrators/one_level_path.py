@@ -34,6 +34,14 @@ class OneLevelPath(CachedIntegrator):
        - Probability of tracing on where the cache or a map could end a path, to correct what they
          get wrong. Above 0 the mean is that of :monosp:`path`: there is no bias, but more
          noise. (Default: 0)
+     * - irradiance_filter
+       - |bool|
+       - Let neighbouring pixels share the indirect light that diffuse surfaces gather, where it
+         can't differ by much. Off where ``residual_probability`` is above 0. (Default: true)
+     * - sampler
+       - |string|
+       - One of Mitsuba's samplers, whatever the scene names, or ``scene`` for the scene's. Those
+         that stratify may round the samples per pixel up. (Default: multijitter)
      * - cache_file
        - |string|
        - File with the baked state, from :monosp:`envmap-render bake`. (Default: none, bake now)
@@ -47,6 +55,7 @@ class OneLevelPath(CachedIntegrator):
         parameters = Parameters(props)
         self.secondary_samples = parameters.integer("secondary_samples", 1, 1, 1 << 16)
         self.residual_probability = parameters.number("residual_probability", 0.0, 0.0, 1.0)
+        self.irradiance_filter = parameters.flag("irradiance_filter", True)
 
     def transport(self, scene, prepared, spp):
         return self.transport_from(

@@ -23,6 +23,10 @@ class SourceSelection(CachedIntegrator):
      * - shadow_samples
        - |int|
        - Shadow rays at a camera hit. (Default: 1)
+     * - sampler
+       - |string|
+       - One of Mitsuba's samplers, whatever the scene names, or ``scene`` for the scene's. Those
+         that stratify may round the samples per pixel up. (Default: multijitter)
      * - cache_file
        - |string|
        - File with the baked state, from :monosp:`envmap-render bake`. (Default: none, bake now)

@@ -26,6 +26,9 @@ MIN_SEEN = 0.005
 MAX_CLUSTERS = 8
 #: Voxels considered, most seen first: bounds the cost of hierarchical clustering.
 MAX_VOXELS = 1500
+#: Part of the time of a render that looking for maps and reading them takes, without which the same
+#: rays are traced in full (measured: 0.10 … 0.15 in seven scenes).
+LOOK_UP_COST = 0.12
 
 
 @dataclass(frozen=True)
@@ -147,6 +150,22 @@ def find_clusters(
             cluster_of_point[member] = len(clusters)
             clusters.append(cluster)
     return clusters, cluster_of_point
+
+
+def worthwhile(
+    points: SurfacePoints, cluster_of_point: np.ndarray, escaped_share: np.ndarray
+) -> bool:
+    """Do maps of the clusters spare more than they cost?
+
+    Shorter rays don't: in a hierarchy of bounding volumes they take about as long as longer ones.
+    What a map has ahead of tracing is that it has averaged light that comes through mirrors and
+    glass, which single paths seldom find. ``escaped_share`` [N] says for every surface point what
+    part of the variance that is at most. Maps take it off where the sensors see a cluster, and
+    their cost is added everywhere.
+    """
+    seen = points.seen > 0
+    mapped = seen & (cluster_of_point >= 0)
+    return escaped_share[mapped].sum() > LOOK_UP_COST * max(seen.sum(), 1)
 
 
 def cluster_of_cell(

@@ -60,8 +60,11 @@ def solve_irradiance(
     cell_of_point: np.ndarray,
     samples: int,
     seed: int = 0,
-) -> IrradianceCache:
+) -> tuple[IrradianceCache, np.ndarray]:
     """Gather and solve for the irradiance of every patch.
+
+    Also returns, of every patch [P], what part of the second moment of the indirect light that
+    its rays bring has come from no patch but through mirrors and glass, or off what has no patches.
 
     ``samples`` rays start from random ones of a patch's surface points, with as many shadow rays;
     ``samples`` must be a power of two. With E_d the direct and E_i the indirect irradiance,
@@ -80,18 +83,25 @@ def solve_irradiance(
     if not parts:  # Nothing but mirrors and glass.
         n_channels = len(mi.Spectrum())
         table = dr.zeros(mi.Float, 2 * transport.patches.count * n_channels)
-        return IrradianceCache(transport.patches, table)
+        return IrradianceCache(transport.patches, table), np.zeros(transport.patches.count)
 
-    direct, escaped, weight, row = (_concatenate(part) for part in zip(*parts, strict=True))
+    direct, escaped, escaped_square, weight, row = (
+        _concatenate(part) for part in zip(*parts, strict=True)
+    )
     patch = upload(mi.UInt32, members.patches)
     table = _solve(transport.patches.count, patch, direct, escaped, weight, row, samples)
-    return IrradianceCache(transport.patches, table)
+    cache = IrradianceCache(transport.patches, table)
+    patched_square = _second_moment(weight * cache.irradiance(row), samples)
+    share = escaped_square / dr.maximum(escaped_square + patched_square, 1e-30)
+    escaped_share = np.zeros(transport.patches.count)
+    escaped_share[members.patches] = share.numpy()
+    return cache, escaped_share
 
 
 def _gather(scene, transport, members, cells, begin, end, samples, seed):
     """Trace the gather rays of the ``begin``-th … ``end``-th patch.
 
-    Returns direct irradiance and π b per patch, throughput and row per ray.
+    Returns direct irradiance, π b and its second moment per patch, throughput and row per ray.
     """
     from ..rendering.transport import PathState, follow, mis_weight
 
@@ -143,10 +153,18 @@ def _gather(scene, transport, members, cells, begin, end, samples, seed):
     direct, escaped, weight = (each(finite, x) for x in (direct, escaped, end_.weight))
     # Block sums evaluate what they sum up: without this, each of them would trace all rays anew.
     dr.eval(direct, escaped, weight, end_.row)
+    escaped_square = _second_moment(escaped, samples)
     direct, escaped = (
         each(lambda c: dr.block_sum(c, samples) / samples, x) for x in (direct, escaped)
     )
-    return direct, escaped, weight, end_.row
+    return direct, escaped, escaped_square, weight, end_.row
+
+
+def _second_moment(light, samples) -> mi.Float:
+    """Mean over the rays of each patch of the square of what they bring, over all channels."""
+    square = dr.square(dr.mean(light))
+    dr.eval(square)
+    return dr.block_sum(square, samples) / samples
 
 
 def _rotated(x, y, rank, seed) -> mi.Point2f:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
+from ..jit import opaque_point
+from .irradiance_filter import Gathered
 from .ray_counts import Ray, count
 from .transport import (
     PathState,
@@ -15,10 +17,32 @@ from .transport import (
     camera_path,
     facing,
     follow,
+    is_diffuse,
     is_wide,
     sample_sources,
+    single_lobe,
     skip_sources,
 )
+
+#: Added to the albedo of what has gloss beside its diffuse lobe: the wide part of gloss is light
+#: that the surface reflects however dark it is.
+GLOSS_ALBEDO = 0.04
+
+
+@dataclass
+class CameraSample:
+    """What a camera ray finds.
+
+    radiance   [W/m²/sr]
+    distance   [m]  to the first hit, infinite if there is none
+    valid           whether there is one (alpha)
+    gathered        the part of the radiance that pixels may share, None if there is none at all
+    """
+
+    radiance: mi.Spectrum
+    distance: mi.Float
+    valid: mi.Bool
+    gathered: Gathered | None = None
 
 
 def camera_radiance(
@@ -28,14 +52,14 @@ def camera_radiance(
     ray: mi.Ray3f,
     active: mi.Bool,
     secondary_samples: int,
-) -> tuple[mi.Spectrum, mi.Float, mi.Bool]:
-    """Radiance [W/m²/sr] along rays, distance to the first hit, whether there was one.
+) -> CameraSample:
+    """What rays of a sensor or a texel find.
 
     Where the cache may end a path at once (``gather_depth`` 0) there are no secondary rays.
     """
     if transport.gather_depth == 0:
         end = follow(scene, transport, sampler, camera_path(ray), active)
-        return end.radiance, end.distance, end.valid
+        return CameraSample(end.radiance, end.distance, end.valid)
     return split(scene, transport, sampler, ray, active, secondary_samples)
 
 
@@ -80,29 +104,52 @@ def split(scene, transport, sampler, ray, active, secondary_samples):
     valid = active & (scene.environment() is not None and not transport.hide_emitters)
     if dr.hint(secondary_samples == 1, mode="scalar"):
         u = sampler.next_1d()
-        arriving, solid = secondary(scene, beyond, sampler, vertex, u, hit)
-        radiance += arriving
+        arriving, wide, nearness, solid = secondary(scene, beyond, sampler, vertex, u, hit)
         valid |= solid
     else:
         i = mi.UInt32(0)
-        arriving = mi.Spectrum(0)
+        arriving, wide, nearness = mi.Spectrum(0), mi.Spectrum(0), mi.Float(0)
         pending = mi.Bool(hit)
         while dr.hint(pending, exclude=[beyond, vertex], label="Secondary rays"):
             u = (mi.Float(i) + sampler.next_1d()) / mi.Float(secondary_samples)
-            one, solid = secondary(scene, beyond, sampler, vertex, u, pending)
-            arriving += one
-            valid |= pending & solid
+            one = secondary(scene, beyond, sampler, vertex, u, pending)
+            arriving += one[0]
+            wide += one[1]
+            nearness += one[2]
+            valid |= pending & one[3]
             i += 1
             pending &= i < secondary_samples
-        radiance += arriving / secondary_samples
-    return radiance, dr.select(hit, si.t, dr.inf), valid
+        arriving /= secondary_samples
+        wide /= secondary_samples
+        nearness /= secondary_samples
+    gathered = gathering(scene, si, bsdf, wide, nearness, smooth)
+    return CameraSample(radiance + arriving, dr.select(hit, si.t, dr.inf), valid, gathered)
+
+
+def gathering(scene, si, bsdf, radiance, nearness, active) -> Gathered:
+    """What pixels may share of the ``radiance`` that the wide lobes of a surface reflect."""
+    albedo = bsdf.eval_diffuse_reflectance(si, active)
+    albedo += dr.select(single_lobe(bsdf), 0, GLOSS_ALBEDO)
+    shared = active & is_diffuse(bsdf) & (dr.max(albedo) > 0)
+    centre = opaque_point(scene.bbox().center())
+    return Gathered(
+        *(
+            dr.select(shared, value, 0)
+            for value in (radiance, albedo, si.sh_frame.n, si.p - centre, nearness, mi.Float(1))
+        )
+    )
 
 
 def secondary(scene, transport, sampler, vertex, u, active):
-    """One secondary ray: radiance [W/m²/sr] that it brings, and whether the surface is solid."""
+    """One secondary ray.
+
+    Returns the radiance [W/m²/sr] that it brings, the part of it by wide lobes, the inverse
+    distance [1/m] to where they were traced, and whether the surface is solid.
+    """
     si = vertex.si
     bs, weight = vertex.bsdf.sample(mi.BSDFContext(), si, u, sampler.next_2d(), active)
     specular = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+    wide = is_wide(si, bs.wo, bs.pdf) & ~specular
     start = PathState(
         ray=si.spawn_ray(si.to_world(bs.wo)),
         depth=dr.select(specular, mi.UInt32(0), mi.UInt32(1)),
@@ -115,11 +162,12 @@ def secondary(scene, transport, sampler, vertex, u, active):
         reach=mi.Float(dr.inf),
     )
     if vertex.cube is not None:
-        wide = is_wide(si, bs.wo, bs.pdf) & ~specular
         start.cluster = vertex.cube.cluster
         start.bounded, start.ray.maxt, start.reach = transport.far_field.bound(
             vertex.cube, start.ray, wide, sampler.next_1d(), active
         )
     end = follow(scene, transport, sampler, start, active & (dr.max(weight) > 0))
     solid = active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
-    return weight * end.radiance, end.valid | solid
+    arriving = weight * end.radiance
+    nearness = dr.rcp(dr.minimum(end.distance, start.ray.maxt))
+    return arriving, dr.select(wide, arriving, 0), dr.select(wide, nearness, 0), end.valid | solid

@@ -66,9 +66,10 @@ class CoarseMesh:
 
     def solve(self, samples: int = 64) -> IrradianceCache:
         transport = Transport(self.patches, self.object_ids, by_weight(Emitters(self.scene)))
-        return solve_irradiance(
+        cache, _ = solve_irradiance(
             self.scene, transport, self.points, self.patch_of_point, self.cell_of_point, samples
         )
+        return cache
 
 
 def coarse_mesh(scene: mi.Scene, budget: int = 1024, points_per_patch: int = 128) -> CoarseMesh:
