@@ -112,10 +112,8 @@ def prepare(scene: mi.Scene, key: str, settings: Settings, baker=None) -> Prepar
                 points, space, scene, settings.requests, settings.distance_ratio
             )
         else:
-            clusters, cluster_of_point = find_clusters(points, space, settings.distance_ratio)
             share = np.where(patch_of_point >= 0, escaped_share[patch_of_point], 0)
-            if not (settings.map_always or worthwhile(points, cluster_of_point, share)):
-                clusters, cluster_of_point = [], np.full(len(points), -1)
+            clusters, cluster_of_point = _paying_clusters(points, space, settings, share)
         membership = cluster_of_cell(
             len(clusters), cluster_of_point, cell_of_point, dr.width(patches.levels)
         )
@@ -124,6 +122,18 @@ def prepare(scene: mi.Scene, key: str, settings: Settings, baker=None) -> Prepar
         members = [points.take(np.flatnonzero(cluster_of_point == i)) for i in range(len(clusters))]
         maps = baker.bake(scene, prepared, clusters, members, settings.map_resolution)
     return replace(prepared, maps=maps, cluster_of_cell=membership)
+
+
+def _paying_clusters(points, space, settings, escaped_share):
+    """As ``find_clusters``; none if their maps wouldn't pay."""
+    none = [], np.full(len(points), -1)
+    # Clusters are only looked for if they would pay at least if everything belonged to one.
+    if not (settings.map_always or worthwhile(points, escaped_share)):
+        return none
+    found = find_clusters(points, space, settings.distance_ratio)
+    if not (settings.map_always or worthwhile(points, escaped_share, found[1] >= 0)):
+        return none
+    return found
 
 
 @contextmanager

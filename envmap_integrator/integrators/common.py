@@ -29,6 +29,9 @@ class CachedIntegrator(mi.SamplingIntegrator):
     PATCH_SAMPLES = 32
     """By default; the noise of many patches averages out where secondary rays end in them."""
 
+    SHADOW_SAMPLES = 2
+    """By default: shared irradiance has little noise, so direct light is worth a ray more."""
+
     def __init__(self, props: mi.Properties):
         check_variant(props.plugin_name())
         super().__init__(props)
@@ -38,7 +41,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
         self.patch_samples = parameters.power_of_two(
             "patch_samples", self.PATCH_SAMPLES, 1, 1 << 16
         )
-        self.shadow_samples = parameters.integer("shadow_samples", 1, 1, 1 << 16)
+        self.shadow_samples = parameters.integer("shadow_samples", self.SHADOW_SAMPLES, 1, 1 << 16)
         self.secondary_samples = 1
         self.residual_probability = 0.0
         self.irradiance_filter = False

@@ -52,6 +52,8 @@ class EnvmapBake(CachedIntegrator):
          false)
     """
 
+    SHADOW_SAMPLES = 1
+
     def __init__(self, props: mi.Properties):
         super().__init__(props)
         self.samples = Parameters(props).power_of_two("samples", 8, 1, 1 << 12)

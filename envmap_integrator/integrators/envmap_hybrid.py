@@ -35,7 +35,7 @@ class EnvmapHybrid(CachedIntegrator):
        - Gather rays and shadow rays per patch, a power of two. (Default: 32)
      * - shadow_samples
        - |int|
-       - Shadow rays at a camera hit (paper: 16). (Default: 1)
+       - Shadow rays at a camera hit (paper: 16). (Default: 2)
      * - secondary_samples
        - |int|
        - Secondary rays at a camera hit (paper: 100). (Default: 1)

@@ -25,7 +25,7 @@ class OneLevelPath(CachedIntegrator):
        - Gather rays and shadow rays per patch, a power of two. (Default: 32)
      * - shadow_samples
        - |int|
-       - Shadow rays at a camera hit. (Default: 1)
+       - Shadow rays at a camera hit. (Default: 2)
      * - secondary_samples
        - |int|
        - Secondary rays at a camera hit. (Default: 1)

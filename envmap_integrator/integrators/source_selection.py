@@ -22,7 +22,7 @@ class SourceSelection(CachedIntegrator):
        - Gather rays and shadow rays per patch, a power of two. (Default: 128)
      * - shadow_samples
        - |int|
-       - Shadow rays at a camera hit. (Default: 1)
+       - Shadow rays at a camera hit. (Default: 2)
      * - sampler
        - |string|
        - One of Mitsuba's samplers, whatever the scene names, or ``scene`` for the scene's. Those

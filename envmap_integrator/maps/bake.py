@@ -45,7 +45,6 @@ def bake_maps(
     half_widths = upload(mi.Float, np.array([cluster.half_width for cluster in clusters]))
     members = SurfacePoints.concatenate(points)
     first = upload(mi.UInt32, np.cumsum([0, *map(len, points)]))
-    position, normals = upload(mi.Float, members.position), upload(mi.Float, members.normal)
     resolution_ = dr.opaque(mi.UInt32, resolution)
     n_pixels = resolution_ * resolution_
 
@@ -79,9 +78,7 @@ def bake_maps(
             first_point = dr.gather(mi.UInt32, first, cluster)
             n_points = dr.gather(mi.UInt32, first, cluster + 1) - first_point
             k = dr.minimum(mi.UInt32(sampler.next_1d() * mi.Float(n_points)), n_points - 1)
-            si = dr.zeros(mi.SurfaceInteraction3f, len(lane))
-            si.p = dr.gather(mi.Point3f, position, first_point + k)
-            si.n = dr.gather(mi.Normal3f, normals, first_point + k)
+            si = members.interaction(first_point + k)
             reached = dr.dot(o - si.p, si.n) > 0
             ray = si.spawn_ray_to(o)
             ray.maxt = dr.norm(o - ray.o)  # No shorter: the start may lie just behind a wall.

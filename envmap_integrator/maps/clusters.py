@@ -153,9 +153,9 @@ def find_clusters(
 
 
 def worthwhile(
-    points: SurfacePoints, cluster_of_point: np.ndarray, escaped_share: np.ndarray
+    points: SurfacePoints, escaped_share: np.ndarray, mapped: np.ndarray | bool = True
 ) -> bool:
-    """Do maps of the clusters spare more than they cost?
+    """Do maps for the surface points that are ``mapped`` [N] spare more than they cost?
 
     Shorter rays don't: in a hierarchy of bounding volumes they take about as long as longer ones.
     What a map has ahead of tracing is that it has averaged light that comes through mirrors and
@@ -164,8 +164,7 @@ def worthwhile(
     their cost is added everywhere.
     """
     seen = points.seen > 0
-    mapped = seen & (cluster_of_point >= 0)
-    return escaped_share[mapped].sum() > LOOK_UP_COST * max(seen.sum(), 1)
+    return escaped_share[seen & mapped].sum() > LOOK_UP_COST * seen.sum()
 
 
 def cluster_of_cell(

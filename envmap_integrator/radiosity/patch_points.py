@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.sparse import coo_matrix
 
 from ..jit import upload
 from .surface_points import SurfacePoints
@@ -16,34 +17,26 @@ class PatchPoints:
     patches   [K]      indices of the patches that have points
     first     [K + 1]  where the points of each begin
     index              which points stand for patches, sorted
-    points             these points
     """
 
     def __init__(self, points: SurfacePoints, patch_of_point: np.ndarray, n_patches: int):
-        order = standing_points(points, patch_of_point)
-        order = order[np.argsort(patch_of_point[order], kind="stable")]
-        patch = patch_of_point[order]
-        first = np.flatnonzero(np.diff(patch, prepend=-1))
-        self.patches = patch[first]
-        self.first = np.append(first, len(order)).astype(np.uint32)
-        self.index = order
-        self.points = points.take(order)
+        standing = standing_points(points, patch_of_point)
+        # Rows of a sparse matrix: a counting sort.
+        place = patch_of_point[standing], np.arange(len(standing))
+        by_patch = coo_matrix((standing, place), (n_patches, len(standing))).tocsr()
+        self.patches = np.flatnonzero(np.diff(by_patch.indptr))
+        self.first = np.append(by_patch.indptr[self.patches], len(standing)).astype(np.uint32)
+        self.index = by_patch.data
+        self._points = points
         self._first = upload(mi.UInt32, self.first)
-        self._position = upload(mi.Float, self.points.position)
-        self._normal = upload(mi.Float, self.points.normal)
-        self._shading_normal = upload(mi.Float, self.points.shading_normal)
+        self._index = upload(mi.UInt32, self.index)
 
     def sample(self, rank: mi.UInt32, u: mi.Float) -> mi.SurfaceInteraction3f:
         """A random point of the ``rank``-th patch, as an interaction from which rays can start."""
         first = dr.gather(mi.UInt32, self._first, rank)
         n_points = dr.gather(mi.UInt32, self._first, rank + 1) - first
-        index = first + dr.minimum(mi.UInt32(u * mi.Float(n_points)), n_points - 1)
-        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(rank))
-        si.p = dr.gather(mi.Point3f, self._position, index)
-        si.n = dr.gather(mi.Normal3f, self._normal, index)
-        si.sh_frame = mi.Frame3f(dr.gather(mi.Normal3f, self._shading_normal, index))
-        si.t = 0
-        return si
+        k = first + dr.minimum(mi.UInt32(u * mi.Float(n_points)), n_points - 1)
+        return self._points.interaction(dr.gather(mi.UInt32, self._index, k))
 
 
 def standing_points(points: SurfacePoints, patch_of_point: np.ndarray) -> np.ndarray:

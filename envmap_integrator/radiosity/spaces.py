@@ -63,12 +63,11 @@ class _Sight:
 
     def __init__(self, scene: mi.Scene, points: SurfacePoints):
         self._scene = scene
-        self._position = upload(mi.Float, points.position)
-        self._normal = upload(mi.Float, points.normal)
+        self._points = points
 
     def __call__(self, a: mi.UInt32, b: mi.UInt32, active: mi.Bool | bool = True) -> mi.Bool:
         """Do the points of indices ``a`` and ``b`` see each other?"""
-        a, b = self._interaction(a), self._interaction(b)
+        a, b = self._points.interaction(a), self._points.interaction(b)
         d = dr.normalize(b.p - a.p)
         ray, back = a.spawn_ray(d), b.spawn_ray(-d)
         # Up to the very end: rays to a point stop short of it by more than a wall may be away.
@@ -89,12 +88,6 @@ class _Sight:
         return _first_seen(
             self, upload(mi.UInt32, points), upload(mi.UInt32, targets), len(targets), sampler
         ).numpy()
-
-    def _interaction(self, index: mi.UInt32) -> mi.SurfaceInteraction3f:
-        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(index))
-        si.p = dr.gather(mi.Point3f, self._position, index)
-        si.n = dr.gather(mi.Normal3f, self._normal, index)
-        return si
 
 
 @dr.syntax
@@ -159,9 +152,7 @@ def _look_around(scene, object_ids, patches, points, space, space_of_patch, seed
     sampler.seed(seed, n_lanes)
     lane = dr.arange(mi.UInt32, n_lanes) // LOOKS
     space_of_patch = upload(mi.UInt32, space_of_patch)
-    si = dr.zeros(mi.SurfaceInteraction3f, n_lanes)
-    si.p = dr.gather(mi.Point3f, upload(mi.Float, points.position), lane)
-    si.n = dr.gather(mi.Normal3f, upload(mi.Float, points.normal), lane)
+    si = points.interaction(lane)
     object_id = dr.gather(mi.UInt32, upload(mi.UInt32, points.object_id), lane)
 
     # ---- Where no walk came, a point is in the space of what it looks at ----

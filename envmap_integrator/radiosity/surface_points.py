@@ -60,6 +60,24 @@ class SurfacePoints:
         low, high = np.percentile(np.ascontiguousarray(self.position.T), [2, 98], axis=1)
         return max(float(np.linalg.norm(high - low)), 1e-30)
 
+    def interaction(self, index: mi.UInt32) -> mi.SurfaceInteraction3f:
+        """The points of the given indices, as interactions from which rays can start."""
+        position, normal, shading_normal = self._vectors
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(index))
+        si.p = dr.gather(mi.Point3f, position, index)
+        si.n = dr.gather(mi.Normal3f, normal, index)
+        si.sh_frame = mi.Frame3f(dr.gather(mi.Normal3f, shading_normal, index))
+        si.t = 0
+        return si
+
+    @cached_property
+    def _vectors(self) -> tuple[mi.Float, mi.Float, mi.Float]:
+        """Positions and normals [3 * N] where kernels can read them."""
+        return tuple(
+            upload(mi.Float, vectors)
+            for vectors in (self.position, self.normal, self.shading_normal)
+        )
+
     def take(self, index: np.ndarray) -> SurfacePoints:
         """The points of the given indices, in that order."""
         return SurfacePoints(*(getattr(self, name)[index] for name in self.__dataclass_fields__))

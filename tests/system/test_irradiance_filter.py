@@ -1,0 +1,130 @@
+"""Pictures whose pixels share what they gather: less noise, the same light, any film."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from compare.metrics import error_floor, rel_mse
+from envmap_integrator.rendering import film as film_module
+from tests.helpers import box, camera, colour, film, integrator, load, picture, room, scaled
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+KINDS = ("envmap_hybrid", "one_level_path")
+SEEDS = 6
+
+
+@pytest.fixture(scope="module")
+def tiled(variant):
+    """A room with chequered walls."""
+    tiles = {
+        "type": "checkerboard",
+        "color0": colour(0.1, 0.2, 0.6),
+        "color1": colour(0.7, 0.5, 0.3),
+        "to_uv": scaled(6),
+    }
+    walls = box(2.0) | {"bsdf": {"type": "diffuse", "reflectance": tiles}}
+    return load(room(walls=walls, sensor=camera(96, 72)))
+
+
+@pytest.fixture(scope="module")
+def reference(tiled):
+    path = mi.load_dict({"type": "path"})
+    return [picture(tiled, path, 1024, seed) for seed in (100, 101)]
+
+
+def pictures(scene, spp=64, kind="one_level_path", **settings):
+    ours = integrator(kind, sampler="multijitter", **settings)
+    return [picture(scene, ours, spp, seed) for seed in range(SEEDS)]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_less_error_with_textures_and_contacts(tiled, reference, kind):
+    """By far less noise, for a bias that is small against it."""
+    shared = pictures(tiled, kind=kind, irradiance_filter=True)
+    apart = pictures(tiled, kind=kind)
+    errors = [np.mean([rel_mse(p, *reference) for p in some]) for some in (shared, apart)]
+    assert errors[0] < errors[1] / 3
+    floors = [error_floor(some, *reference) for some in (shared, apart)]
+    assert floors[0] < floors[1] + 1e-4
+
+
+def test_bias_falls_with_samples(tiled, reference):
+    few, many = (
+        error_floor(pictures(tiled, spp, irradiance_filter=True), *reference) for spp in (4, 256)
+    )
+    assert many < few / 2
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_light_is_the_same(tiled, kind):
+    shared = np.mean([p.mean() for p in pictures(tiled, kind=kind, irradiance_filter=True)])
+    apart = np.mean([p.mean() for p in pictures(tiled, kind=kind)])
+    assert shared == pytest.approx(apart, rel=2e-3)
+
+
+def test_without_bias_nothing_is_shared(tiled):
+    a, b = (
+        picture(tiled, integrator("one_level_path", residual_probability=0.5, irradiance_filter=on))
+        for on in (True, False)
+    )
+    np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("irradiance_filter", [True, False])
+class TestFilms:
+    """What Mitsuba's own integrators do with films, ours do."""
+
+    def compare_means(self, sensor, irradiance_filter, **settings):
+        scene = load(room(sensor=sensor))
+        ours = integrator("one_level_path", irradiance_filter=irradiance_filter, **settings)
+        own, path = (picture(scene, i, 256) for i in (ours, mi.load_dict({"type": "path"})))
+        assert own.shape == path.shape
+        np.testing.assert_allclose(own.mean(axis=(0, 1)), path.mean(axis=(0, 1)), rtol=0.02)
+        return own, path
+
+    def test_alpha(self, irradiance_filter):
+        film_ = film(32, 24, pixel_format="rgba")
+        own, path = self.compare_means(camera(film=film_), irradiance_filter)
+        np.testing.assert_allclose(own[..., 3], path[..., 3], atol=1e-5)
+
+    def test_crop_window(self, irradiance_filter):
+        window = dict(crop_offset_x=5, crop_offset_y=3, crop_width=17, crop_height=11)
+        own, path = self.compare_means(camera(film=film(32, 24, **window)), irradiance_filter)
+        assert own.shape[:2] == (11, 17)
+
+    @pytest.mark.parametrize("rfilter", ["gaussian", "mitchell"])
+    def test_reconstruction_filter(self, irradiance_filter, rfilter):
+        film_ = film(32, 24, rfilter={"type": rfilter}, sample_border=True)
+        self.compare_means(camera(film=film_), irradiance_filter)
+
+    def test_thin_lens_and_shutter(self, irradiance_filter):
+        lens = {"type": "thinlens", "aperture_radius": 0.1, "focus_distance": 2.0}
+        shutter = {"shutter_open": 0.0, "shutter_close": 1.0}
+        self.compare_means(camera() | lens | shutter, irradiance_filter)
+
+    def test_several_passes(self, irradiance_filter, monkeypatch):
+        """Of as many samples each, and the same sample points all together."""
+        monkeypatch.setattr(film_module, "MAX_LANES", 32 * 24 * 100)
+        self.compare_means(camera(), irradiance_filter, sampler="multijitter")
+
+    def test_undeveloped(self, irradiance_filter):
+        scene = load(room())
+        ours = integrator("one_level_path", irradiance_filter=irradiance_filter)
+        ours.render(scene, spp=4, develop=False)
+        later = np.array(scene.sensors()[0].film().develop())
+        np.testing.assert_array_equal(later, picture(scene, ours, 4))
+
+
+def test_passes_are_equal_and_small_enough(monkeypatch):
+    monkeypatch.setattr(film_module, "MAX_LANES", 1000)
+    assert film_module._passes(100, 10) == 1
+    assert film_module._passes(100, 64) == 8
+    assert film_module._passes(100, 23) == 23
+    assert film_module._passes(5000, 2) == 2
+
+
+def test_one_pixel(variant):
+    assert picture(load(room(sensor=camera(1, 1))), mi.load_dict({"type": "envmap_hybrid"})).any()
