@@ -14,10 +14,10 @@ from dataclasses import dataclass, field
 import mitsuba as mi
 import numpy as np
 
-from compare.denoiser import denoise, warm_up
 from compare.metrics import Picture
 from compare.scenes import PATH, Subject
 from envmap_integrator.cli.timing import compilation_time, measure, record_kernels
+from envmap_integrator.denoiser import denoise, warm_up
 from envmap_integrator.progress import stage
 
 

@@ -57,6 +57,9 @@ def build_parser() -> argparse.ArgumentParser:
     )
     render.add_argument("--seed", type=int, default=0, help="of the sampler")
     render.add_argument("--png", action="store_true", help="also write an sRGB PNG beside the EXR")
+    render.add_argument(
+        "--denoise", action="store_true", help="by Open Image Denoise; films get a box filter"
+    )
     render.set_defaults(command=commands.render)
 
     bake = subparsers.add_parser("bake", help="compute what rendering reuses, and save it")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -15,6 +16,7 @@ import envmap_integrator
 from envmap_integrator.cli.output import replacing, write_png
 from envmap_integrator.cli.scene_file import SceneFile
 from envmap_integrator.cli.timing import compilation_time, measure, record_kernels
+from envmap_integrator.denoiser import denoise
 from envmap_integrator.llvm import ensure_llvm
 
 
@@ -33,9 +35,12 @@ def render(args: argparse.Namespace) -> int:
             seconds |= scene.integrator().prepare(scene).stage_times
         with measure(seconds, "render"):
             dr.eval(mi.render(scene, sensor=sensor, seed=args.seed, spp=args.spp))
+        bitmap = sensor.film().bitmap()
+        if args.denoise:
+            with measure(seconds, "denoise"):
+                _denoise(bitmap, scene, args)
         compilation = compilation_time()
 
-    bitmap = sensor.film().bitmap()
     metadata = bitmap.metadata()
     metadata["envmap_integrator"] = envmap_integrator.__version__
     metadata["settings"] = json.dumps(settings)
@@ -47,6 +52,17 @@ def render(args: argparse.Namespace) -> int:
         write_png(output.with_suffix(".png"), bitmap)
     _report(seconds, compilation, output)
     return 0
+
+
+def _denoise(bitmap: mi.Bitmap, scene: mi.Scene, args: argparse.Namespace) -> None:
+    """Denoise the radiance channels of ``bitmap`` in place."""
+    pixels = np.array(bitmap, copy=False)
+    _require(
+        pixels.ndim == 3 and pixels.shape[2] >= 3,
+        '--denoise needs colour: set the film\'s "pixel_format" to rgb or rgba',
+    )
+    spp = args.spp or scene.sensors()[args.sensor].sampler().sample_count()
+    pixels[:, :, :3] = denoise(scene, pixels[:, :, :3], spp, args.seed, args.sensor)
 
 
 def bake(args: argparse.Namespace) -> int:
@@ -92,6 +108,8 @@ def _load(
     with measure(seconds, "load"):
         scene_file = SceneFile(args.scene, dict(args.define))
         scene_file.configure_integrator(args.integrator, dict(args.set))
+        if getattr(args, "denoise", False):
+            scene_file.configure_reconstruction_filters("box")
         return scene_file, scene_file.load(merge_meshes)
 
 
@@ -115,6 +133,7 @@ def _settings(
         "sensor": args.sensor,
         "spp": args.spp or sensor.sampler().sample_count(),
         "seed": args.seed,
+        "denoised": args.denoise,
         "integrator": scene_file.integrator.plugin_name(),
         "integrator_settings": str(scene.integrator()),
     }

@@ -70,11 +70,16 @@ class SceneFile:
             for key in [key for key in film.props.keys() if key.startswith("crop_")]:
                 del film.props[key]
             film.props["width"], film.props["height"] = width, height
+        self.configure_reconstruction_filters("box")
+
+    def configure_reconstruction_filters(self, plugin: str) -> None:
+        """Give every film this reconstruction filter."""
+        for film in [node for node in self._state.nodes if node.type == mi.ObjectType.Film]:
             filters = self._children(film, mi.ObjectType.ReconstructionFilter)
             for node in filters:
-                node.props = mi.Properties("box")
+                node.props = mi.Properties(plugin)
             if not filters:
-                self._append_child(film, mi.ObjectType.ReconstructionFilter, "box")
+                self._append_child(film, mi.ObjectType.ReconstructionFilter, plugin)
 
     def configure_samplers(self, plugin: str) -> None:
         """Have every sensor draw its sample points from ``plugin``; sample counts stay."""

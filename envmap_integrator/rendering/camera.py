@@ -11,12 +11,14 @@ from ..jit import opaque_point
 from .irradiance_filter import Gathered
 from .ray_counts import Ray, count
 from .transport import (
+    RR_DEPTH,
     PathState,
     Transport,
     Vertex,
     camera_path,
     facing,
     follow,
+    is_delta,
     is_diffuse,
     is_wide,
     sample_sources,
@@ -65,18 +67,31 @@ def camera_radiance(
 
 @dr.syntax
 def split(scene, transport, sampler, ray, active, secondary_samples):
-    """Shade the first hit once and send secondary rays from it.
+    """Shade the first surface that isn't a mirror or glass, and send secondary rays from it.
 
-    The first vertex stands outside the loop over the others also for a single secondary ray: it
-    needs no patch and those need hardly any shadow rays, which saves a fifth of the time.
+    This vertex stands outside the loop over the others also for a single secondary ray: it needs no
+    patch and those need hardly any shadow rays, which saves a fifth of the time.
     """
-    # ---------------------- First vertex ----------------------
+    # ---------------------- First hit ----------------------
 
     count(Ray.PRIMARY, ray, active)
     pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
     if dr.hint(transport.hide_emitters, mode="scalar"):
         pi = skip_sources(scene, ray, pi, active)
     si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+    distance = dr.select(active & si.is_valid(), si.t, dr.inf)
+    shown = active & (not transport.hide_emitters)
+    valid = shown & (scene.environment() is not None)
+    throughput = mi.Spectrum(1)
+    if dr.hint(transport.far_field is None or not transport.far_field.map_mirrors, mode="scalar"):
+        mirrored = active & si.is_valid() & is_delta(si.bsdf(ray))
+        shown |= mirrored
+        si, ray, throughput, solid = follow_mirrors(scene, sampler, si, ray, mirrored)
+        valid |= solid
+
+    # ---------------------- First vertex ----------------------
+
+    active &= dr.max(throughput) > 0
     hit = active & si.is_valid()
     bsdf = si.bsdf(ray)
     smooth = hit & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
@@ -92,7 +107,7 @@ def split(scene, transport, sampler, ray, active, secondary_samples):
     no = mi.Bool(False)
     vertex = Vertex(si, bsdf, sources, source_row, no, no, cube, mi.Float(1))
 
-    emitted = si.emitter(scene).eval(si, active & (not transport.hide_emitters))
+    emitted = si.emitter(scene).eval(si, active & shown)
     n_shadow = transport.shadow_samples
     radiance = emitted + sample_sources(
         scene, vertex, sampler, mi.UInt32(n_shadow), n_shadow > 1, smooth
@@ -101,7 +116,6 @@ def split(scene, transport, sampler, ray, active, secondary_samples):
     # ---------------------- Secondary rays ----------------------
 
     beyond = replace(transport, hide_emitters=False)
-    valid = active & (scene.environment() is not None and not transport.hide_emitters)
     if dr.hint(secondary_samples == 1, mode="scalar"):
         u = sampler.next_1d()
         arriving, wide, nearness, solid = secondary(scene, beyond, sampler, vertex, u, hit)
@@ -123,7 +137,39 @@ def split(scene, transport, sampler, ray, active, secondary_samples):
         wide /= secondary_samples
         nearness /= secondary_samples
     gathered = gathering(scene, si, bsdf, wide, nearness, smooth)
-    return CameraSample(radiance + arriving, dr.select(hit, si.t, dr.inf), valid, gathered)
+    gathered.radiance *= throughput
+    gathered.albedo *= throughput
+    return CameraSample(throughput * (radiance + arriving), distance, valid, gathered)
+
+
+@dr.syntax
+def follow_mirrors(scene, sampler, si, ray, active):
+    """Follow perfect mirrors and glass to what is seen in them.
+
+    Returns an interaction, invalid where nothing is seen, the ray to it, the throughput, and
+    whether anything on the way was solid.
+    """
+    si, ray, active = mi.SurfaceInteraction3f(si), mi.Ray3f(ray), mi.Bool(active)
+    throughput, eta, bounces, solid = mi.Spectrum(1), mi.Float(1), mi.UInt32(0), mi.Bool(False)
+    while dr.hint(active, label="Follow mirrors"):
+        bs, weight = si.bsdf(ray).sample(
+            mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active
+        )
+        solid |= active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+        throughput[active] *= weight
+        eta[active] *= bs.eta
+        bounces += 1
+        survival = dr.minimum(dr.max(throughput) * dr.square(eta), 0.95)
+        roulette = active & (bounces >= RR_DEPTH)
+        lost = roulette & (sampler.next_1d() >= survival)
+        throughput[roulette] *= dr.rcp(survival)
+        throughput[lost] = 0
+        active &= dr.max(throughput) > 0
+        ray = dr.select(active, si.spawn_ray(si.to_world(bs.wo)), ray)
+        count(Ray.UNBOUNDED, ray, active)
+        si = dr.select(active, scene.ray_intersect(ray, active), si)
+        active &= si.is_valid() & is_delta(si.bsdf(ray))
+    return si, ray, throughput, solid
 
 
 def gathering(scene, si, bsdf, radiance, nearness, active) -> Gathered:

@@ -530,6 +530,12 @@ def is_diffuse(bsdf):
     return mi.has_flag(flags, mi.BSDFFlags.DiffuseReflection) & ~transmits
 
 
+def is_delta(bsdf):
+    """Does a material do nothing but reflect and refract as perfect mirrors and glass?"""
+    flags = bsdf.flags()
+    return mi.has_flag(flags, mi.BSDFFlags.Delta) & ~mi.has_flag(flags, mi.BSDFFlags.Smooth)
+
+
 def single_lobe(bsdf):
     """Does a material scatter by diffuse reflection alone?"""
     others = mi.BSDFFlags.Glossy | mi.BSDFFlags.Delta | mi.BSDFFlags.DiffuseTransmission

@@ -26,7 +26,7 @@ OTHERS = {"cornell-box": 0.02, "staircase2": 0.02, "veach-ajar": 0.05, "living-r
 
 def assert_like_path(scene, allowed: float = 0.02, spp: int = 256, precision: float = 0.03):
     hybrid, path = (mi.load_dict({"type": name}) for name in ("envmap_hybrid", "path"))
-    ours = measure(scene, hybrid).overall()
+    ours = measure(scene, hybrid, spp).overall()
     assert_agree(ours, measure(scene, path, spp).overall(), allowed, precision)
 
 

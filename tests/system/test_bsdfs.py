@@ -53,6 +53,8 @@ ROOMS = tuple(
     )
 )
 MATERIALS = sum(ROOMS, ())
+#: Maps are made whether they pay or not.
+OURS = {"type": "envmap_hybrid", "maps": "always", "shadow_samples": 1}
 #: Traced in full, so that they need no cube.
 PERFECT = ("conductor", "dielectric", "thindielectric")
 PARTS = ("table", "ball")
@@ -272,7 +274,7 @@ def in_room(names: tuple[str, ...]) -> dict[tuple[str, str], Comparison]:
     # Caustics of glass are noise: there, the lamp is nearly as large as the ceiling.
     lamp_size = 1.9 if "dielectric" in names else 0.8
     scene = load(room(lamp_size) | tables(bsdfs) | balls(bsdfs))
-    ours = mi.load_dict({"type": "envmap_hybrid", "maps": "always"})
+    ours = mi.load_dict(OURS)
     cubes = [m.cluster for m in ours.prepare(scene).maps]
     below = sum(cube.centre[2] < 0 for cube in cubes)
     assert below == sum(name not in PERFECT for name in names), "tables without a cube"
@@ -318,7 +320,7 @@ def in_furnace() -> dict[tuple[str, str], Comparison]:
         | balls(bsdfs, places)
     )
     regions = [seen(scene, f"{part}{i}") for i in range(len(bsdfs)) for part in PARTS]
-    ours = mi.load_dict({"type": "envmap_hybrid", "maps": "always"})
+    ours = mi.load_dict(OURS)
     results = compare(scene, ours, regions, SPP, 0, BRIGHTEST)
     return dict(zip(product(MATERIALS, PARTS), results, strict=True))
 

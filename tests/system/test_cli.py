@@ -1,6 +1,7 @@
 """``envmap-render`` from its arguments to its files, messages and exit codes."""
 
 import json
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,6 +13,7 @@ import pytest
 from envmap_integrator.cli import main
 from envmap_integrator.cli.output import replacing
 from envmap_integrator.cli.scene_file import SceneFile
+from envmap_integrator.denoiser import denoise
 
 SCENE = """
 <scene version="3.0.0">
@@ -118,6 +120,21 @@ def test_a_baked_state_serves_later_renders(tmp_path):
     assert run("bake", scene, "-o", state, *options) == 0
     for _ in range(3):
         assert run("render", scene, "--spp", 1, *options, "--set", f"cache_file={state}") == 0
+
+
+def test_a_picture_can_be_denoised(scene, tmp_path):
+    """As by the denoiser called by hand, on a film with a box filter."""
+    output = tmp_path / "denoised.exr"
+    assert run("render", scene, "-o", output, "--spp", 4, "--denoise", "--png") == 0
+    assert json.loads(header(output)["stage_times"])["denoise"] > 0
+    assert json.loads(header(output)["settings"])["denoised"]
+    scene_file = SceneFile(scene)
+    scene_file.configure_reconstruction_filters("box")
+    loaded = scene_file.load()
+    noisy = np.array(mi.render(loaded, spp=4, seed=0))[..., :3]
+    expected = denoise(loaded, noisy, 4, 0)
+    np.testing.assert_allclose(pixels(output)[..., :3], expected, atol=2e-3)
+    assert np.abs(expected - noisy).max() > 0.01
 
 
 def test_films_can_be_resized(scene):
@@ -227,6 +244,12 @@ def test_bad_input_gives_one_line_and_exit_code_2(scene, capsys, options, messag
 def test_missing_scene(tmp_path, capsys):
     assert run("render", tmp_path / "none.xml") == 2
     assert "none.xml" in capsys.readouterr().err
+
+
+def test_denoising_without_the_denoiser(scene, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "mitsuba_oidn", None)
+    assert run("render", scene, "--spp", 1, "--denoise") == 2
+    assert "pip install mitsuba-oidn" in capsys.readouterr().err
 
 
 def test_bake_without_pre_pass(scene, tmp_path, capsys):
