@@ -89,8 +89,7 @@ def filter_irradiance(gathered: Gathered, width: int, allowed: float) -> mi.Spec
     ``allowed`` is the ``tolerance``. The unit is that of the sums.
     """
     dr.eval(gathered.channels())
-    records = _records(gathered)
-    result = _average(records, gathered, width, dr.opaque(mi.Float, 1 / allowed))
+    result = _average(_records(gathered), width, dr.opaque(mi.Float, 1 / allowed))
     dr.eval(result)
     return result
 
@@ -98,10 +97,13 @@ def filter_irradiance(gathered: Gathered, width: int, allowed: float) -> mi.Spec
 def _records(gathered: Gathered) -> mi.Float:
     """What a pixel is asked for by its neighbours [_RECORD * pixels]."""
     n_pixels = dr.width(gathered.weight)
-    shared = gathered.weight > 0
+    # What isn't finite would spread.
+    finite = dr.isfinite(dr.sum(gathered.radiance) + dr.sum(gathered.albedo))
+    shared = (gathered.weight > 0) & finite
     scale = dr.select(shared, dr.rcp(gathered.weight), 0)
     near = mi.Vector4f(gathered.nearness * scale)
-    near.x, near.y, near.z = dr.select(shared, dr.normalize(gathered.normal), 0)
+    length = dr.sqrt(dr.squared_norm(gathered.normal))
+    near.x, near.y, near.z = dr.select(shared & (length > 0), gathered.normal / length, 0)
     place = mi.Vector4f(dr.select(shared, mi.Float(1), 0))
     place.x, place.y, place.z = gathered.position * scale
     records = dr.empty(mi.Float, _RECORD * n_pixels)
@@ -118,7 +120,7 @@ def _padded(colour: mi.Spectrum) -> mi.Vector4f:
 
 
 @dr.syntax
-def _average(records, gathered, width, sharpness):
+def _average(records, width, sharpness):
     n_pixels = dr.width(records) // _RECORD
     own = dr.arange(mi.UInt32, n_pixels)
     width_ = dr.opaque(mi.Int32, width)

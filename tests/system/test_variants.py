@@ -16,7 +16,10 @@ from tests.helpers import assert_agree, integrator, load, measure, room
 for variant in ("llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"):
     mi.set_variant(variant)
     scene = load(room())
-    ours, path = (measure(scene, integrator(name), spp=256) for name in ("envmap_hybrid", "path"))
+    ours, path = (
+        measure(scene, one, spp=256)
+        for one in (integrator("envmap_hybrid", irradiance_filter=True), integrator("path"))
+    )
     assert_agree(ours.overall(), path.overall(), allowed=0.02, precision=0.02)
 """
 IMPORT_LATE = """

@@ -100,6 +100,13 @@ def test_pixels_without_a_surface_give_and_get_nothing():
     np.testing.assert_allclose(result, weight, rtol=1e-5)
 
 
+def test_what_is_not_finite_stays_where_it_is():
+    irradiance = np.ones((HEIGHT, WIDTH))
+    irradiance[10, 10] = np.inf
+    result = filtered(irradiance)
+    assert np.isfinite(np.delete(result, 10 * WIDTH + 10)).all()
+
+
 def test_less_is_allowed_for_as_samples_grow():
     allowed = np.array([tolerance(n) for n in (1, 16, 64, 4096, 1 << 24)])
     assert (np.diff(allowed) < 0).all() and allowed[-1] < 0.05
