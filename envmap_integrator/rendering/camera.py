@@ -11,7 +11,6 @@ from ..jit import opaque_point
 from .irradiance_filter import Gathered
 from .ray_counts import Ray, count
 from .transport import (
-    RR_DEPTH,
     PathState,
     Transport,
     Vertex,
@@ -24,6 +23,7 @@ from .transport import (
     sample_sources,
     single_lobe,
     skip_sources,
+    survival_probability,
 )
 
 #: Added to the albedo of what has gloss beside its diffuse lobe: the wide part of gloss is light
@@ -159,11 +159,9 @@ def follow_mirrors(scene, sampler, si, ray, active):
         throughput[active] *= weight
         eta[active] *= bs.eta
         bounces += 1
-        survival = dr.minimum(dr.max(throughput) * dr.square(eta), 0.95)
-        roulette = active & (bounces >= RR_DEPTH)
-        lost = roulette & (sampler.next_1d() >= survival)
-        throughput[roulette] *= dr.rcp(survival)
-        throughput[lost] = 0
+        survival = survival_probability(throughput, eta, bounces)
+        survives = sampler.next_1d() < survival
+        throughput[active] *= dr.select(survives, dr.rcp(survival), 0)
         active &= dr.max(throughput) > 0
         ray = dr.select(active, si.spawn_ray(si.to_world(bs.wo)), ray)
         count(Ray.UNBOUNDED, ray, active)

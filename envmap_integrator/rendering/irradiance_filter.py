@@ -144,9 +144,9 @@ def _average(records, width, sharpness):
         turn = dr.sqrt(dr.maximum(1 - dr.dot(its_near.xyz, near.xyz), 0))
         change = (distance * dr.maximum(its_near.w, near.w) + turn) * sharpness
         weight = taper * dr.exp(-dr.square(change))
-        weight = dr.select(inside & (its_place.w > 0), weight, 0)
-        radiance_sum += weight * its_radiance
-        albedo_sum += weight * its_albedo
+        shared = inside & (its_place.w > 0)
+        radiance_sum += dr.select(shared, weight * its_radiance, 0)
+        albedo_sum += dr.select(shared, weight * its_albedo, 0)
         i += 1
     mean = dr.select(albedo_sum > 0, radiance_sum / albedo_sum, 0) * albedo
     mean = dr.select(albedo > 0, mean, radiance)

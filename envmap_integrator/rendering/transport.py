@@ -37,8 +37,10 @@ NARROW_PDF = 1.0
 #: Choices among the lobes of a surface that the cache serves: those that it can't stand for, such
 #: as the gloss of a varnish, are found as many times more often as if one choice were made.
 LOBE_CHOICES = 4
-#: Bounces before Russian roulette may end a path that neither cache nor map has ended.
-RR_DEPTH = 6
+#: Bounces before Russian roulette may end a path that neither cache nor map has ended, and before
+#: it may end one that has lost no light: a path in glass that is reflected on and on would come out
+#: a firefly if it had to survive one chance in twenty of its end at each bounce.
+RR_DEPTH, LOSSLESS_RR_DEPTH = 6, 128
 
 
 #: Neighbouring lanes that decide alike whether to estimate a residual: they share SIMD registers.
@@ -380,13 +382,19 @@ def follow(
         # ---------------------- Russian roulette ----------------------
 
         bounces += 1
-        survival = dr.minimum(dr.max(throughput) * dr.square(eta), 0.95)
-        roulette = active & (bounces >= RR_DEPTH)
-        active &= ~roulette | (sampler.next_1d() < survival)
-        throughput[roulette] *= dr.rcp(survival)
+        survival = survival_probability(throughput, eta, bounces)
+        active &= sampler.next_1d() < survival
+        throughput[active] *= dr.rcp(survival)
         count_secondary(ray, bounded, retrace, active)
 
     return PathEnd(radiance, direct, weight, row, valid, distance)
+
+
+def survival_probability(throughput, eta, bounces):
+    """With which a path goes on after so many bounces: Russian roulette."""
+    capped = dr.select(bounces < LOSSLESS_RR_DEPTH, mi.Float(1), 0.95)
+    kept = dr.minimum(dr.max(throughput) * dr.square(eta), capped)
+    return dr.select(bounces < RR_DEPTH, 1, kept)
 
 
 def facing(si, ray):
