@@ -85,11 +85,15 @@ def choose_sources(
     inside = (slot >= 0) & (square > 0)
     found = np.bincount(slot[inside], square[inside], (n_cells + 1) * n).reshape(-1, n)
     found[-1] = np.bincount(emitter, square, n)
-    found[found.sum(axis=1) == 0] = found[-1]
-    found = np.sqrt(found)
+    # Most slots of the cells' hash table are empty: they get what is true of all.
+    known = found.any(axis=1)
+    found = np.sqrt(found[known])
     found /= found.sum(axis=1, keepdims=True)
     probability = (1 - UNINFORMED) * found + UNINFORMED * weights
-    return SourceChoice(emitters, upload(mi.Float, alias_tables(probability)))
+    rows = alias_tables(probability).astype(np.float32)
+    tables = np.repeat(rows[-1:], n_cells + 1, axis=0)
+    tables[known] = rows
+    return SourceChoice(emitters, upload(mi.Float, tables))
 
 
 def sample_irradiance(scene, choice, si, row, u):
