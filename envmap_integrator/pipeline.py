@@ -54,7 +54,8 @@ class Prepared:
 
     key                content hash of the scene, and the settings
     cache              irradiance on the patches
-    sources            [R * L * 4]  probabilities of the emitters (``SourceChoice.table``)
+    sources            [R * L * 4]  probabilities of the emitters (``SourceChoice.table``),
+    source_rows        [C]          ... and which row is each large cell's
     maps               one cube map per cluster
     cluster_of_cell    cluster index of each large cell, ``len(maps)`` where there is none
     stage_times        seconds spent in each stage
@@ -63,6 +64,7 @@ class Prepared:
     key: str
     cache: IrradianceCache
     sources: mi.Float
+    source_rows: mi.UInt32
     maps: tuple[CubeMap, ...] = ()
     cluster_of_cell: np.ndarray | None = None
     stage_times: dict[str, float] = field(default_factory=dict)
@@ -102,7 +104,7 @@ def prepare(scene: mi.Scene, key: str, settings: Settings, baker=None) -> Prepar
             cell_of_point,
             settings.patch_samples,
         )
-    prepared = Prepared(key, cache, sources.table, stage_times=times)
+    prepared = Prepared(key, cache, sources.table, sources.row_of_cell, stage_times=times)
     if not settings.maps:
         return prepared
 
@@ -158,6 +160,7 @@ def save(path, prepared: Prepared) -> None:
         "levels": {"entry": _image(patches.levels.numpy())},
         "irradiance": {"Y": _image(prepared.cache.table.numpy())},
         "sources": {"alias": _image(prepared.sources.numpy())},
+        "source_rows": {"row": _image(prepared.source_rows.numpy())},
     }
     if prepared.cluster_of_cell is not None:
         parts["cluster_of_cell"] = {"cluster": _image(prepared.cluster_of_cell)}
@@ -175,6 +178,7 @@ def save(path, prepared: Prepared) -> None:
         "use_objects": patches.use_objects,
         "channels": len(mi.Spectrum()),
         "sources": dr.width(prepared.sources),
+        "source_rows": dr.width(prepared.source_rows),
         "maps": maps,
         "stage_times": prepared.stage_times,
     }
@@ -212,11 +216,12 @@ def load(path, key: str, owner: str) -> Prepared:
     )
     table = upload(mi.Float, values("irradiance", "Y", 2 * n_patches * metadata["channels"]))
     sources = upload(mi.Float, values("sources", "alias", metadata["sources"]))
+    source_rows = upload(mi.UInt32, values("source_rows", "row", metadata["source_rows"]))
     membership = None
     if "cluster_of_cell" in parts:
         membership = values("cluster_of_cell", "cluster", metadata["levels"])
     cache = IrradianceCache(patches, table)
-    return Prepared(key, cache, sources, maps, membership, metadata["stage_times"])
+    return Prepared(key, cache, sources, source_rows, maps, membership, metadata["stage_times"])
 
 
 def _image(values: np.ndarray) -> np.ndarray:

@@ -107,7 +107,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
         return Transport(
             prepared.cache.patches,
             object_ids,
-            SourceChoice(emitters, prepared.sources),
+            SourceChoice(emitters, prepared.sources, prepared.source_rows),
             cache=prepared.cache,
             shadow_samples=self.shadow_samples,
             **more,

@@ -85,15 +85,14 @@ def choose_sources(
     inside = (slot >= 0) & (square > 0)
     found = np.bincount(slot[inside], square[inside], (n_cells + 1) * n).reshape(-1, n)
     found[-1] = np.bincount(emitter, square, n)
-    # Most slots of the cells' hash table are empty: they get what is true of all.
     known = found.any(axis=1)
     found = np.sqrt(found[known])
     found /= found.sum(axis=1, keepdims=True)
     probability = (1 - UNINFORMED) * found + UNINFORMED * weights
-    rows = alias_tables(probability).astype(np.float32)
-    tables = np.repeat(rows[-1:], n_cells + 1, axis=0)
-    tables[known] = rows
-    return SourceChoice(emitters, upload(mi.Float, tables))
+    # Most slots of the cells' hash table are empty, and share the last row.
+    row_of_cell = np.where(known, np.cumsum(known), known.sum()) - 1
+    table = upload(mi.Float, alias_tables(probability))
+    return SourceChoice(emitters, table, upload(mi.UInt32, row_of_cell[:-1]))
 
 
 def sample_irradiance(scene, choice, si, row, u):

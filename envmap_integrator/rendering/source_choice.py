@@ -47,20 +47,23 @@ class Emitters:
 class SourceChoice:
     """Probabilities of the emitters in each large cell of the coarse mesh, and anywhere else.
 
-    emitters   the L emitters to choose from
-    table      [R * L * 4]  alias tables (Walker 1974): where the first emitter's share of a bin
-                            ends, the second emitter, and the probabilities of both; one row a
-                            large cell, the last one for all other places
+    emitters      the L emitters to choose from
+    table         [R * L * 4]  alias tables (Walker 1974): where the first emitter's share of a bin
+                               ends, the second emitter, and the probabilities of both
+    row_of_cell   [C]          row for each large cell, [1] if it's the same for all; the last row
+                               is that of all other places
     """
 
     emitters: Emitters
     table: mi.Float
+    row_of_cell: mi.UInt32
 
     def row(self, cell: mi.UInt32, found: mi.Bool) -> mi.UInt32:
         """Row of the table for places in a large cell, if they are in one."""
         n_rows = dr.width(self.table) // (4 * max(self.emitters.count, 1))
         last = dr.opaque(mi.UInt32, max(n_rows - 1, 0))
-        return dr.select(found, dr.minimum(cell, last), last)
+        cell = dr.minimum(cell, dr.opaque(mi.UInt32, dr.width(self.row_of_cell) - 1))
+        return dr.select(found, dr.gather(mi.UInt32, self.row_of_cell, cell, found), last)
 
     def sample_direction(self, ref, row, u, active):
         """Choose a source and a direction to it: ``(ds, weight)``, as Mitsuba's scene does.
@@ -93,8 +96,9 @@ class SourceChoice:
 
 
 def by_weight(emitters: Emitters) -> SourceChoice:
-    """A choice that knows nothing of places: one row."""
-    return SourceChoice(emitters, upload(mi.Float, alias_tables(emitters.weights[None])))
+    """A choice that knows nothing of places: one row for all cells."""
+    table = upload(mi.Float, alias_tables(emitters.weights[None]))
+    return SourceChoice(emitters, table, mi.UInt32(0))
 
 
 def alias_tables(probability: np.ndarray) -> np.ndarray:

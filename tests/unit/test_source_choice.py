@@ -129,6 +129,14 @@ def test_places_in_no_cell_use_the_last_row(hall, choice):
     assert by_weight(choice.emitters).row(mi.UInt32(3), mi.Bool(True)).numpy() == 0
 
 
+def test_rows_are_for_cells_that_are_lit(choice):
+    """Not for every slot of the cells' hash table: those would be gigabytes for many emitters."""
+    rows = choice.row_of_cell.numpy()
+    n_rows = len(choice.table.numpy()) // (4 * choice.emitters.count)
+    used = rows[rows < n_rows - 1]
+    assert len(np.unique(used)) == len(used) == n_rows - 1 < len(rows) / 2
+
+
 def test_sampling_weights_count():
     """Those of weight 0 are never chosen; the others in proportion where nothing is known."""
     scene = scene_of(lamp_at(-1, sampling_weight=0.0), lamp_at(0, sampling_weight=3.0), lamp_at(1))
@@ -159,5 +167,6 @@ def test_the_largest_random_number_is_in_the_last_bin():
     scene = scene_of(lamp_at(-1), lamp_at(1))
     si = dr.zeros(mi.SurfaceInteraction3f, 1)
     u = mi.Point2f(1 - 2**-24, 0.5)
-    ds, _ = SourceChoice(Emitters(scene), table).sample_direction(si, mi.UInt32(0), u, True)
+    choice = SourceChoice(Emitters(scene), table, mi.UInt32(0))
+    ds, _ = choice.sample_direction(si, mi.UInt32(0), u, True)
     assert np.isfinite(ds.p.numpy()).all()
