@@ -8,8 +8,9 @@ import mitsuba as mi
 from ..progress import stage
 from .irradiance_filter import Gathered, filter_irradiance, tolerance
 
-#: Camera rays per kernel launch: bounds memory.
-MAX_LANES = 1 << 25
+#: Camera rays per kernel launch, as Mitsuba has it. Within one launch nothing is stored for a ray;
+#: between launches, the samplers' states are.
+MAX_LANES = (1 << 32) - 1
 
 
 def pixel_sampler(sensor: mi.Sensor, plugin: str, spp: int) -> mi.Sampler:
