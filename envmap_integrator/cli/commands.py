@@ -16,7 +16,7 @@ import envmap_integrator
 from envmap_integrator.cli.output import replacing, write_png
 from envmap_integrator.cli.scene_file import SceneFile
 from envmap_integrator.cli.timing import compilation_time, measure, record_kernels
-from envmap_integrator.denoiser import denoise
+from envmap_integrator.denoiser import denoise, warm_up
 from envmap_integrator.llvm import ensure_llvm
 
 
@@ -31,6 +31,8 @@ def render(args: argparse.Namespace) -> int:
         scene_file, scene = _load(args, seconds)
         sensor = _sensor(scene, args.sensor)
         settings = _settings(args, scene_file, scene, sensor)
+        if args.denoise:  # Fails before the work starts, if there is no denoiser.
+            warm_up(*sensor.film().crop_size())
         if hasattr(scene.integrator(), "prepare"):
             seconds |= scene.integrator().prepare(scene).stage_times
         with measure(seconds, "render"):
@@ -38,7 +40,7 @@ def render(args: argparse.Namespace) -> int:
         bitmap = sensor.film().bitmap()
         if args.denoise:
             with measure(seconds, "denoise"):
-                _denoise(bitmap, scene, args)
+                _denoise(bitmap, scene, settings)
         compilation = compilation_time()
 
     metadata = bitmap.metadata()
@@ -54,15 +56,15 @@ def render(args: argparse.Namespace) -> int:
     return 0
 
 
-def _denoise(bitmap: mi.Bitmap, scene: mi.Scene, args: argparse.Namespace) -> None:
+def _denoise(bitmap: mi.Bitmap, scene: mi.Scene, settings: dict[str, object]) -> None:
     """Denoise the radiance channels of ``bitmap`` in place."""
     pixels = np.array(bitmap, copy=False)
     _require(
         pixels.ndim == 3 and pixels.shape[2] >= 3,
         '--denoise needs colour: set the film\'s "pixel_format" to rgb or rgba',
     )
-    spp = args.spp or scene.sensors()[args.sensor].sampler().sample_count()
-    pixels[:, :, :3] = denoise(scene, pixels[:, :, :3], spp, args.seed, args.sensor)
+    spp, seed, sensor = (settings[key] for key in ("spp", "seed", "sensor"))
+    pixels[:, :, :3] = denoise(scene, pixels[:, :, :3], spp, seed, sensor)
 
 
 def bake(args: argparse.Namespace) -> int:

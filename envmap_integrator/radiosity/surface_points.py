@@ -151,7 +151,9 @@ def scatter_points(
 
 def _sensor_rays(sensor: mi.Sensor, sampler: mi.Sampler) -> mi.Ray3f:
     time = sensor.shutter_open() + sensor.shutter_open_time() * sampler.next_1d()
-    ray, _ = sensor.sample_ray(time, sampler.next_1d(), sampler.next_2d(), sampler.next_2d())
+    ray, _ = sensor.sample_ray_differential(
+        time, sampler.next_1d(), sampler.next_2d(), sampler.next_2d()
+    )
     return mi.Ray3f(ray)
 
 

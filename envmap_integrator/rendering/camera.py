@@ -46,6 +46,11 @@ class CameraSample:
     valid: mi.Bool
     gathered: Gathered | None = None
 
+    def scaled(self, factor: mi.Spectrum | mi.Float) -> CameraSample:
+        """The same, seen with a throughput or a weight of the sensor [1]."""
+        gathered = self.gathered and self.gathered.scaled(factor)
+        return replace(self, radiance=factor * self.radiance, gathered=gathered)
+
 
 def camera_radiance(
     scene: mi.Scene,
@@ -137,9 +142,7 @@ def split(scene, transport, sampler, ray, active, secondary_samples):
         wide /= secondary_samples
         nearness /= secondary_samples
     gathered = gathering(scene, si, bsdf, wide, nearness, smooth)
-    gathered.radiance *= throughput
-    gathered.albedo *= throughput
-    return CameraSample(throughput * (radiance + arriving), distance, valid, gathered)
+    return CameraSample(radiance + arriving, distance, valid, gathered).scaled(throughput)
 
 
 @dr.syntax

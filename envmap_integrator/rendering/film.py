@@ -35,11 +35,10 @@ def expose(sensor: mi.Sensor, sampler: mi.Sampler, seed, shade, names: list[str]
     film = sensor.film()
     film.prepare(names)
 
-    def values(sampler, ray):
-        found = shade(sampler, ray)
-        return found.radiance, found.valid, aovs(found)
+    def channels(found):
+        return found.radiance, aovs(found)
 
-    film.put_block(_accumulate(sensor, sampler, seed, values))
+    film.put_block(_accumulate(sensor, sampler, seed, shade, channels))
 
 
 def expose_filtered(sensor: mi.Sensor, sampler: mi.Sampler, seed, shade, n_samples: int) -> None:
@@ -48,15 +47,13 @@ def expose_filtered(sensor: mi.Sensor, sampler: mi.Sampler, seed, shade, n_sampl
     ``shade(sampler, ray)`` gives a ``CameraSample``.
     """
 
-    def values(sampler, ray):
-        found = shade(sampler, ray)
-        gathered = found.gathered
-        return found.radiance - gathered.radiance, found.valid, gathered.channels()
+    def channels(found):
+        return found.radiance - found.gathered.radiance, found.gathered.channels()
 
     film = sensor.film()
     n_guides = Gathered.count()
     film.prepare([f"gathered{i}" for i in range(n_guides)])
-    block = _accumulate(sensor, sampler, seed, values)
+    block = _accumulate(sensor, sampler, seed, shade, channels)
     tensor = block.tensor()
     height, width, n_channels = tensor.shape
     pixel = dr.arange(mi.UInt32, height * width)
@@ -74,8 +71,12 @@ def expose_filtered(sensor: mi.Sensor, sampler: mi.Sampler, seed, shade, n_sampl
     film.put_block(mi.ImageBlock(picture, block.offset()))
 
 
-def _accumulate(sensor, sampler, seed, shade) -> mi.ImageBlock:
-    """Sums over the samples of each pixel, in the channels that the film has been prepared for."""
+def _accumulate(sensor, sampler, seed, shade, channels) -> mi.ImageBlock:
+    """Sums over the samples of each pixel, in the channels that the film has been prepared for.
+
+    ``channels(found)`` gives the radiance of a ``CameraSample`` that is shown, and the values of
+    further channels.
+    """
     film = sensor.film()
     size = mi.ScalarVector2u(film.crop_size())
     border = film.rfilter().border_size() if film.sample_border() else 0
@@ -96,7 +97,7 @@ def _accumulate(sensor, sampler, seed, shade) -> mi.ImageBlock:
     position += mi.Vector2i(film.crop_offset()) - border
     with stage("Rendering", total=n_passes) as advance:
         for _ in range(n_passes):
-            _pass(sensor, sampler, shade, block, position)
+            _pass(sensor, sampler, shade, channels, block, position)
             if n_passes > 1:
                 sampler.advance()
                 sampler.schedule_state()
@@ -112,7 +113,7 @@ def _passes(n_pixels: int, spp: int) -> int:
     return next(n for n in range(min(least, spp), spp + 1) if spp % n == 0)
 
 
-def _pass(sensor, sampler, shade, block, position) -> None:
+def _pass(sensor, sampler, shade, channels, block, position) -> None:
     """One sample or several of each pixel."""
     film = sensor.film()
     place = mi.Vector2f(position) + sampler.next_2d()
@@ -121,14 +122,15 @@ def _pass(sensor, sampler, shade, block, position) -> None:
     time = mi.Float(sensor.shutter_open())
     if sensor.shutter_open_time() > 0:
         time += sampler.next_1d() * sensor.shutter_open_time()
-    ray, weight = sensor.sample_ray(time, 0, within, aperture)
-    radiance, valid, values = shade(sampler, mi.Ray3f(ray))
-    channels = [*_rgb(weight * radiance)]
+    ray, weight = sensor.sample_ray_differential(time, 0, within, aperture)
+    found = shade(sampler, mi.Ray3f(ray)).scaled(weight)
+    radiance, further = channels(found)
+    values = [*_rgb(radiance)]
     if mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
-        channels.append(dr.select(valid, mi.Float(1), 0))
+        values.append(dr.select(found.valid, mi.Float(1), 0))
     # With a box filter, a sample on the border of its pixel belongs there.
     at = mi.Vector2f(position) if film.rfilter().is_box_filter() else place
-    block.put(at, [*channels, mi.Float(1), *values])
+    block.put(at, [*values, mi.Float(1), *further])
 
 
 def _rgb(radiance: mi.Spectrum) -> tuple[mi.Float, mi.Float, mi.Float]:

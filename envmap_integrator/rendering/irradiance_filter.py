@@ -10,7 +10,7 @@ touched.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -53,6 +53,10 @@ class Gathered:
             value = getattr(self, name)
             values += [value] if dr.depth_v(value) == 1 else [*value]
         return values
+
+    def scaled(self, factor: mi.Spectrum | mi.Float) -> Gathered:
+        """The same, seen with a throughput or a weight of the sensor [1]."""
+        return replace(self, radiance=factor * self.radiance, albedo=factor * self.albedo)
 
     @classmethod
     def count(cls) -> int:

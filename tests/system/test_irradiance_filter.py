@@ -8,7 +8,19 @@ import pytest
 
 from compare.metrics import error_floor, rel_mse
 from envmap_integrator.rendering import film as film_module
-from tests.helpers import box, camera, colour, film, integrator, load, picture, room, scaled
+from tests.helpers import (
+    at,
+    box,
+    camera,
+    colour,
+    film,
+    grey,
+    integrator,
+    load,
+    picture,
+    room,
+    scaled,
+)
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -104,6 +116,15 @@ class TestFilms:
         lens = {"type": "thinlens", "aperture_radius": 0.1, "focus_distance": 2.0}
         shutter = {"shutter_open": 0.0, "shutter_close": 1.0}
         self.compare_means(camera() | lens | shutter, irradiance_filter)
+
+    def test_weighted_sensor(self, irradiance_filter):
+        """One whose rays don't count as one: irradiance is π times their mean."""
+        meter = {"type": "irradiancemeter", "film": film(1, 1), "sampler": {"type": "independent"}}
+        plate = {"type": "rectangle", "to_world": at(0, -0.5, 0), "meter": meter}
+        scene = load(room(sensor=None, plate=plate | grey(0.5)))
+        ours = integrator("one_level_path", irradiance_filter=irradiance_filter)
+        own, path = (picture(scene, i, 1 << 16) for i in (ours, mi.load_dict({"type": "path"})))
+        np.testing.assert_allclose(own, path, rtol=0.02)
 
     def test_several_passes(self, irradiance_filter, monkeypatch):
         """Of as many samples each, and the same sample points all together."""
