@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..progress import stage
-from .irradiance_filter import Gathered, filter_irradiance, tolerance
+from .irradiance_filter import Gathered, filter_irradiance, pixel_records, tolerance
 
 #: Camera rays per kernel launch, as Mitsuba has it. Within one launch nothing is stored for a ray;
 #: between launches, the samplers' states are.
@@ -54,21 +54,32 @@ def expose_filtered(sensor: mi.Sensor, sampler: mi.Sampler, seed, shade, n_sampl
     n_guides = Gathered.count()
     film.prepare([f"gathered{i}" for i in range(n_guides)])
     block = _accumulate(sensor, sampler, seed, shade, channels)
-    tensor = block.tensor()
-    height, width, n_channels = tensor.shape
-    pixel = dr.arange(mi.UInt32, height * width)
-    sums = [dr.gather(mi.Float, tensor.array, pixel * n_channels + i) for i in range(n_channels)]
-    shown, guides = sums[:-n_guides], sums[-n_guides:]
-    shared = filter_irradiance(Gathered.of_channels(guides), width, tolerance(n_samples))
+    offset, (height, width, n_channels) = block.offset(), block.tensor().shape
+    n_shown = n_channels - n_guides
+    # These are the largest arrays of a render: none outlives its use.
+    shown = _channels(block, range(n_shown))
+    dr.eval(shown)
+    records = pixel_records(Gathered.of_channels(_channels(block, range(n_shown, n_channels))))
+    del block
+    film.prepare([])
+    dr.flush_malloc_cache()
+    shared = filter_irradiance(records, width, tolerance(n_samples))
     for index, value in enumerate(_rgb(shared)):
         shown[index] += value
 
-    film.prepare([])
-    picture = dr.empty(mi.Float, len(shown) * height * width)
+    picture = dr.empty(mi.Float, n_shown * height * width)
+    pixel = dr.arange(mi.UInt32, height * width)
     for index, value in enumerate(shown):
-        dr.scatter(picture, value, pixel * len(shown) + index)
-    picture = mi.TensorXf(picture, (height, width, len(shown)))
-    film.put_block(mi.ImageBlock(picture, block.offset()))
+        dr.scatter(picture, value, pixel * n_shown + index)
+    film.put_block(mi.ImageBlock(mi.TensorXf(picture, (height, width, n_shown)), offset))
+
+
+def _channels(block: mi.ImageBlock, which: range) -> list[mi.Float]:
+    """Some channels of all pixels, each [height * width]."""
+    tensor = block.tensor()
+    height, width, count = tensor.shape
+    first = dr.arange(mi.UInt32, height * width) * count
+    return [dr.gather(mi.Float, tensor.array, first + index) for index in which]
 
 
 def _accumulate(sensor, sampler, seed, shade, channels) -> mi.ImageBlock:

@@ -86,20 +86,19 @@ def tolerance(n_samples: int) -> float:
     return TOLERANCE * n_samples ** (-1 / 6)
 
 
-def filter_irradiance(gathered: Gathered, width: int, allowed: float) -> mi.Spectrum:
+def filter_irradiance(records: mi.Float, width: int, allowed: float) -> mi.Spectrum:
     """The gathered radiance of every pixel, from the irradiance around it.
 
-    ``gathered`` holds the pixels' sums over samples, row by row, in an image of ``width`` pixels;
-    ``allowed`` is the ``tolerance``. The unit is that of the sums.
+    ``records`` are those of an image of ``width`` pixels, row by row; ``allowed`` is the
+    ``tolerance``. The unit is that of the sums in the records.
     """
-    dr.eval(gathered.channels())
-    result = _average(_records(gathered), width, dr.opaque(mi.Float, 1 / allowed))
+    result = _average(records, width, dr.opaque(mi.Float, 1 / allowed))
     dr.eval(result)
     return result
 
 
-def _records(gathered: Gathered) -> mi.Float:
-    """What a pixel is asked for by its neighbours [_RECORD * pixels]."""
+def pixel_records(gathered: Gathered) -> mi.Float:
+    """What a pixel is asked for by its neighbours [_RECORD * pixels], from sums over its samples."""
     n_pixels = dr.width(gathered.weight)
     # What isn't finite would spread.
     finite = dr.isfinite(dr.sum(gathered.radiance) + dr.sum(gathered.albedo))

@@ -12,6 +12,7 @@ from envmap_integrator.rendering.irradiance_filter import (
     RADIUS,
     Gathered,
     filter_irradiance,
+    pixel_records,
     tolerance,
 )
 
@@ -47,7 +48,7 @@ def filtered(
         nearness=image(nearness),
         weight=image(np.ones((HEIGHT, WIDTH))),
     )
-    result = filter_irradiance(gathered, WIDTH, ALLOWED)
+    result = filter_irradiance(pixel_records(gathered), WIDTH, ALLOWED)
     assert dr.width(result) == HEIGHT * WIDTH
     return result[0].numpy().reshape(HEIGHT, WIDTH) / spp
 
