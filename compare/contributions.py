@@ -48,9 +48,8 @@ class Ledger:
 
     def of_pictures(self, pictures: Sequence[Picture]) -> Contribution:
         """The whole error of a variant, against the reference."""
-        halves = self.judged_by.half_a, self.judged_by.half_b
         return Contribution(
-            jackknife([error_floor(some, *halves) for some in leaving_out(pictures)]),
+            jackknife([error_floor(some, self.judged_by.thirds) for some in leaving_out(pictures)]),
             mean_bias(pictures, self.judged_by.part_means),
             np.mean(pictures, axis=0, dtype=np.float64) - self.judged_by.picture,
         )
@@ -72,7 +71,7 @@ class Ledger:
         # Differences know nothing of the reference but the scale.
         middle = self.judged_by.picture.astype(np.float64)
         pictures = [middle + error for error in errors]
-        return np.array([error_floor(some, middle, middle) for some in leaving_out(pictures)])
+        return np.array([error_floor(some, (middle,) * 3) for some in leaving_out(pictures)])
 
 
 def leaving_out(pictures: Sequence[Picture]) -> Iterator[list[Picture]]:

@@ -13,6 +13,9 @@ from scipy import stats
 
 Picture = NDArray[np.float32]
 
+Thirds = tuple[Picture, Picture, Picture]
+"""Independent pictures of a reference."""
+
 REL_MSE_EPSILON = 0.01
 """Keeps black pixels from dominating: times the reference's squared mean."""
 
@@ -25,27 +28,29 @@ class Estimate:
     margin: float
 
 
-def rel_mse(picture: Picture, half_a: Picture, half_b: Picture, tile: int = 1) -> float:
+def rel_mse(picture: Picture, reference: Thirds, tile: int = 1) -> float:
     """relMSE = mean((I-R)² / (R² + ε·mean(R)²)) against the unknown noise-free reference R.
 
-    The two halves A, B of the reference have independent errors, so (I-A)(I-B) has the expectation
+    The thirds A, B, C of the reference have independent errors, so (I-A)(I-B) has the expectation
     (I-R)²: no reference noise is counted as ours. (Near zero error it may come out negative.)
-    The denominator takes R = (A+B)/2, which leaves an error of the order of the square of the
-    reference's own relMSE. ``tile`` > 1 compares averages over tiles of that many pixels squared.
+    C stands for R in the denominator, which weights the pixels: were it A's or B's mean, pixels
+    where both happen to have missed rare light would count most, an error that no picture is free
+    of. The result is the mean over the three choices of C. ``tile`` > 1 compares averages over
+    tiles of that many pixels squared.
     """
-    return _error_product(picture, picture, half_a, half_b, tile)
+    return _error_product(picture, picture, reference, tile)
 
 
-def error_floor(pictures: list[Picture], half_a: Picture, half_b: Picture, tile: int = 1) -> float:
+def error_floor(pictures: list[Picture], reference: Thirds, tile: int = 1) -> float:
     """relMSE that is left of the mean of infinitely many such pictures.
 
     Two pictures of independent seeds share nothing but their bias: the mean over all pairs of
     (I-A)(J-B) is free of the noise of either. (With no bias it may come out negative.)
     """
     total, n = np.sum(pictures, axis=0, dtype=np.float64), len(pictures)
-    own = sum(_error_product(p, p, half_a, half_b, tile) for p in pictures)
+    own = sum(_error_product(p, p, reference, tile) for p in pictures)
     mean = total / n
-    return (n * n * _error_product(mean, mean, half_a, half_b, tile) - own) / (n * (n - 1))
+    return (n * n * _error_product(mean, mean, reference, tile) - own) / (n * (n - 1))
 
 
 def rel_mse_of_difference(picture: Picture, other: Picture) -> float:
@@ -54,9 +59,12 @@ def rel_mse_of_difference(picture: Picture, other: Picture) -> float:
     return float(np.mean((picture.astype(np.float64) - other) ** 2 / _scale(mean)))
 
 
-def _error_product(i, j, half_a, half_b, tile) -> float:
-    i, j, a, b = (tiles(p, tile).astype(np.float64) for p in (i, j, half_a, half_b))
-    return float(np.mean((i - a) * (j - b) / _scale((a + b) / 2)))
+def _error_product(i, j, reference, tile) -> float:
+    i, j, *thirds = (tiles(p, tile).astype(np.float64) for p in (i, j, *reference))
+    turns = (np.roll(range(3), turn) for turn in range(3))
+    return float(
+        np.mean([(i - thirds[a]) * (j - thirds[b]) / _scale(thirds[c]) for a, b, c in turns])
+    )
 
 
 def _scale(reference):

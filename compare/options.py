@@ -30,7 +30,7 @@ class Options:
 class JudgedOptions(Options):
     """What experiments are told that compare pictures with a reference."""
 
-    reference_spp: int = option("samples per pixel of each half of the reference", 1024, 256)
+    reference_spp: int = option("samples per pixel of each third of the reference", 1024, 256)
 
 
 def add_options(parser: argparse.ArgumentParser, kind: type[Options]) -> None:

@@ -202,17 +202,16 @@ def _judge(
     lookup: str, value: float, measured: Measurements, judged_by: Reference, mask: Mask
 ) -> Case:
     pictures = measured.pictures()
-    halves = judged_by.half_a, judged_by.half_b
     region = [within(picture, mask) for picture in pictures]
-    region_halves = [within(half, mask) for half in halves]
+    region_thirds = tuple(within(third, mask) for third in judged_by.thirds)
     return Case(
         lookup=lookup,
         value=value,
         measured=measured,
-        error=estimate([rel_mse(picture, *halves) for picture in pictures]),
-        region_error=estimate([rel_mse(picture, *region_halves) for picture in region]),
-        floor=error_floor(pictures, *halves),
-        region_floor=error_floor(region, *region_halves),
+        error=estimate([rel_mse(picture, judged_by.thirds) for picture in pictures]),
+        region_error=estimate([rel_mse(picture, region_thirds) for picture in region]),
+        floor=error_floor(pictures, judged_by.thirds),
+        region_floor=error_floor(region, region_thirds),
     )
 
 
@@ -265,7 +264,7 @@ def error_table(
         [f"look-up, {heading}", "picture", "table top", "floor", "floor, table top", *more],
         rows,
         "Means over the runs with 95 % intervals. Floor: error without noise. Reference: "
-        f"2 × {judged_by.spp} spp of path, relMSE {judged_by.rel_mse:.1e}, taken out of the "
+        f"3 × {judged_by.spp} spp of path, relMSE {judged_by.rel_mse:.1e}, taken out of the "
         "errors.",
     )
 

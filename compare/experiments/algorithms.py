@@ -205,13 +205,12 @@ def _report(
 
 
 def _result(one: Measurements, judged_by: Reference) -> dict[str, object]:
-    halves = judged_by.half_a, judged_by.half_b
-    errors = [rel_mse(picture, *halves) for picture in one.pictures()]
+    errors = [rel_mse(picture, judged_by.thirds) for picture in one.pictures()]
     return {
         **one.numbers(),
         "rel_mse": estimate(errors),
         "rel_mse_of_runs": errors,
-        "error_floor": error_floor(one.pictures(), *halves),
+        "error_floor": error_floor(one.pictures(), judged_by.thirds),
         "bias_of_mean": mean_bias(one.pictures(), judged_by.part_means),
     }
 
@@ -286,7 +285,7 @@ def _error_table(block: Block, results: Mapping[str, dict], judged_by: Reference
         f"Errors with {block.title}",
         ["integrator", "spp", "total s", "relMSE", "floor", "bias %"],
         [],
-        f"Floor: error without noise. Reference: 2 × {judged_by.spp} spp of path, "
+        f"Floor: error without noise. Reference: 3 × {judged_by.spp} spp of path, "
         f"relMSE {judged_by.rel_mse:.1e}, taken out of the errors.",
     )
     for one in block.measured:

@@ -58,7 +58,7 @@ class Options(JudgedOptions):
     """See ``--help``."""
 
     runs: int = option("pictures of each variant, each with a seed of its own; at least 3", 16, 8)
-    reference_spp: int = option("samples per pixel of each half of the reference", 4096, 1024)
+    reference_spp: int = option("samples per pixel of each third of the reference", 4096, 1024)
     spp: int = option("samples per pixel", 64)
     patches: int = option("budget of patches of the coarse mesh", 16384)
     finer: int = option("how many times finer the finer forms are, a power of four", 16, 4)
@@ -206,7 +206,7 @@ def _report(
                 name: {
                     "settings": one.settings,
                     "rays": one.rays,
-                    "error_floor": error_floor(one.pictures, judged_by.half_a, judged_by.half_b),
+                    "error_floor": error_floor(one.pictures, judged_by.thirds),
                     "bias_of_mean": mean_bias(one.pictures, judged_by.part_means),
                 }
                 for name, one in rendered.items()
@@ -279,7 +279,7 @@ def _step_table(title: str, errors: Split, judged_by: Reference) -> Table:
         "each error alone and what is left of the sum without it; shares of the sum add up. Means "
         "with 95 % intervals over the seeds of rendering; noise of the preparation counts as "
         "error. Intervals leave out the noise of the reference: "
-        f"2 × {judged_by.spp} spp of path, relMSE {judged_by.rel_mse:.1e}.",
+        f"3 × {judged_by.spp} spp of path, relMSE {judged_by.rel_mse:.1e}.",
     )
 
 

@@ -115,17 +115,16 @@ def _curves(
 ) -> Iterator[Curve]:
     """The noisy curve of a subject and, if it was denoised, the denoised one."""
     own = [one for one in measured if one.subject == subject]
-    halves = judged_by.half_a, judged_by.half_b
 
     def curve(name, pictures, seconds):
         return Curve(
             name=name,
             spp=[one.spp for one in own],
-            errors=np.array([[rel_mse(p, *halves) for p in pictures(one)] for one in own]),
+            errors=np.array([[rel_mse(p, judged_by.thirds) for p in pictures(one)] for one in own]),
             seconds=np.array([[seconds(run) for run in one.runs] for one in own]),
             prepare_s=np.array([[run.prepare_s for run in one.runs] for one in own]),
-            floor=error_floor(pictures(own[-1]), *halves),
-            tiled_floor=error_floor(pictures(own[-1]), *halves, tile=8),
+            floor=error_floor(pictures(own[-1]), judged_by.thirds),
+            tiled_floor=error_floor(pictures(own[-1]), judged_by.thirds, tile=8),
         )
 
     yield curve(subject.name, Measurements.pictures, lambda run: run.total_s)
@@ -210,7 +209,7 @@ def _speed_up_table(report: Report, curves: list[Curve]) -> Table:
         "Means over the seeds with 95 % intervals. Floor: relMSE without noise, of pixels and of "
         f"averages over 8×8. ≈: {first.name} needs more samples than were rendered, its error is "
         "extrapolated as 1/spp. –: not reached. Reference: "
-        f"2 × {reference['spp_of_each_half']} spp, its own relMSE {reference['rel_mse']:.1e}, "
+        f"3 × {reference['spp_of_each_third']} spp, its own relMSE {reference['rel_mse']:.1e}, "
         "taken out of all errors.",
     )
 

@@ -64,7 +64,6 @@ def _compare(view: View, options: Options, folder: Path) -> Report:
 def _report(
     view: View, options: Options, measured: list[Measurements], judged_by: Reference
 ) -> Report:
-    halves = judged_by.half_a, judged_by.half_b
     *ours, path = measured
     table = Table(
         f"{view.name}, {view.size[0]}×{view.size[1]}",
@@ -72,7 +71,7 @@ def _report(
          "relMSE", "floor", "bias %"],
         [],
         f"Medians of {options.runs} interleaved runs; compilation is apart and not in the total. "
-        f"Floor: error without noise. Reference: 2 × {judged_by.spp} spp of path, "
+        f"Floor: error without noise. Reference: 3 × {judged_by.spp} spp of path, "
         f"relMSE {judged_by.rel_mse:.1e}, taken out of the errors.",
     )  # fmt: skip
     report = Report(
@@ -84,8 +83,8 @@ def _report(
     )
     results = {}
     for one in measured:
-        errors = [rel_mse(picture, *halves) for picture in one.pictures()]
-        floor = error_floor(one.pictures(), *halves)
+        errors = [rel_mse(picture, judged_by.thirds) for picture in one.pictures()]
+        floor = error_floor(one.pictures(), judged_by.thirds)
         bias = mean_bias(one.pictures(), judged_by.part_means)
         results[one.subject.name] = {
             **one.numbers(),

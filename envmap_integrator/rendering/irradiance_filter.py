@@ -98,7 +98,7 @@ def filter_irradiance(records: mi.Float, width: int, allowed: float) -> mi.Spect
 
 
 def pixel_records(gathered: Gathered) -> mi.Float:
-    """What a pixel is asked for by its neighbours [_RECORD * pixels], from sums over its samples."""
+    """What neighbours ask a pixel for, from sums over its samples [_RECORD * pixels]."""
     n_pixels = dr.width(gathered.weight)
     # What isn't finite would spread.
     finite = dr.isfinite(dr.sum(gathered.radiance) + dr.sum(gathered.albedo))
