@@ -30,7 +30,7 @@ from .rendering.transport import Transport
 from .storage import StorageError, read, write
 
 #: Surface points per patch of the budget.
-POINTS_PER_PATCH = 16
+POINTS_PER_PATCH = 24
 
 
 @dataclass(frozen=True)

@@ -81,18 +81,19 @@ def choose_sources(
     square = np.square(light.irradiance.numpy().astype(np.float64)) * weights[emitter]
     if not square.any():
         return by_weight(emitters)
-    slot = np.repeat(cell, SAMPLES) * n + emitter
-    inside = (slot >= 0) & (square > 0)
-    found = np.bincount(slot[inside], square[inside], (n_cells + 1) * n).reshape(-1, n)
+    cell = np.repeat(cell, SAMPLES)
+    inside = (cell >= 0) & (square > 0)
+    # Most slots of the cells' hash table are empty, and share the last row.
+    known = np.bincount(cell[inside], minlength=n_cells) > 0
+    row_of_cell = np.where(known, np.cumsum(known) - 1, known.sum())
+    slot = row_of_cell[cell[inside]] * n + emitter[inside]
+    found = np.bincount(slot, square[inside], (known.sum() + 1) * n).reshape(-1, n)
     found[-1] = np.bincount(emitter, square, n)
-    known = found.any(axis=1)
-    found = np.sqrt(found[known])
+    found = np.sqrt(found)
     found /= found.sum(axis=1, keepdims=True)
     probability = (1 - UNINFORMED) * found + UNINFORMED * weights
-    # Most slots of the cells' hash table are empty, and share the last row.
-    row_of_cell = np.where(known, np.cumsum(known), known.sum()) - 1
     table = upload(mi.Float, alias_tables(probability))
-    return SourceChoice(emitters, table, upload(mi.UInt32, row_of_cell[:-1]))
+    return SourceChoice(emitters, table, upload(mi.UInt32, row_of_cell))
 
 
 def sample_irradiance(scene, choice, si, row, u):

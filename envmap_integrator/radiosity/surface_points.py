@@ -19,8 +19,9 @@ from ..scene_order import ordered_shapes
 
 #: Hits followed along each global line, and along each walk from a sensor.
 LINE_HITS, WALK_HITS = 8, 4
-#: Batches of rays cast at most to find as many points as asked for.
-MAX_BATCHES = 8
+#: Batches of rays cast at most to find about as many points as asked for, what share of them is
+#: enough, and how many times as many rays may be cast as if none were lost.
+MAX_BATCHES, ENOUGH, MAX_RAYS = 4, 0.9, 8
 
 
 @dataclass(frozen=True)
@@ -129,24 +130,47 @@ def scatter_points(
         wanted = wanted | mi.BSDFFlags.DeltaReflection
     sampler = mi.load_dict({"type": "independent"})
     sensors = scene.sensors()
-    n_walks = max(count // (2 * WALK_HITS * max(len(sensors), 1)), 1)
-    n_lines = max((count // 2 if sensors else count) // LINE_HITS, 1)
-    lines, walks = [], []
+
+    def walks(n_rays, batch):
+        points = []
+        for index, sensor in enumerate(sensors):
+            sampler.seed(1009 * (MAX_BATCHES * seed + batch) + index + 1, n_rays)
+            ray = _sensor_rays(sensor, sampler)
+            points.append(
+                _hits_along(scene, object_ids, sampler, ray, WALK_HITS, wanted, index + 1)
+            )
+        return points
+
+    def lines(n_rays, batch):
+        sampler.seed(1009 * (MAX_BATCHES * seed + batch), n_rays)
+        ray = _global_lines(scene, sampler)
+        return [_hits_along(scene, object_ids, sampler, ray, LINE_HITS, wanted)]
+
+    points = []
+    if sensors:
+        points += _enough(walks, count // 2, WALK_HITS * len(sensors))
+        count -= count // 2
+    return SurfacePoints.concatenate(points + _enough(lines, count, LINE_HITS))
+
+
+def _enough(trace, count: int, n_hits: int) -> list[SurfacePoints]:
+    """Points of about ``count`` hits, ``n_hits`` of a ray at most.
+
+    Rays miss open scenes and leave them early: ``trace(n_rays, batch)`` goes on until there are
+    enough hits. Recording a batch costs more than tracing it, so the second is made to be the last.
+    """
+    least = max(count // n_hits, 1)
+    points, found, traced = [], 0, 0
+    n_rays = least
     for batch in range(MAX_BATCHES):
-        # Rays miss open scenes and leave them early: go on until there are enough hits.
-        seed_ = MAX_BATCHES * seed + batch
-        if sum(map(len, walks)) < count // 2:
-            for index, sensor in enumerate(sensors):
-                sampler.seed(1009 * seed_ + index + 1, n_walks)
-                ray = _sensor_rays(sensor, sampler)
-                walks.append(
-                    _hits_along(scene, object_ids, sampler, ray, WALK_HITS, wanted, index + 1)
-                )
-        if sum(map(len, lines)) < (count // 2 if sensors else count):
-            sampler.seed(1009 * seed_, n_lines)
-            ray = _global_lines(scene, sampler)
-            lines.append(_hits_along(scene, object_ids, sampler, ray, LINE_HITS, wanted))
-    return SurfacePoints.concatenate(walks + lines)
+        points += trace(n_rays, batch)
+        traced += n_rays
+        found = sum(map(len, points))
+        if found >= ENOUGH * count or traced >= MAX_RAYS * least:
+            break
+        missing = (count - found) * traced // max(found, 1)
+        n_rays = min(max(missing, 1), MAX_RAYS * least - traced)
+    return points
 
 
 def _sensor_rays(sensor: mi.Sensor, sampler: mi.Sampler) -> mi.Ray3f:
