@@ -11,12 +11,20 @@ from ..parameters import Parameters
 from ..pipeline import Prepared, Settings, load, prepare
 from ..radiosity.surface_points import ObjectIds
 from ..rendering.camera import CameraSample, camera_radiance
-from ..rendering.film import expose, expose_filtered, pixel_sampler
+from ..rendering.film import expose, expose_filtered
 from ..rendering.source_choice import Emitters, SourceChoice
 from ..rendering.transport import Residual, Transport
 
-#: Mitsuba's samplers, and that of the scene.
-SAMPLERS = ("multijitter", "independent", "stratified", "ldsampler", "orthogonal", "scene")
+#: Our own sample points, Mitsuba's samplers, and that of the scene.
+SAMPLERS = (
+    "coherent",
+    "multijitter",
+    "independent",
+    "stratified",
+    "ldsampler",
+    "orthogonal",
+    "scene",
+)
 
 
 class CachedIntegrator(mi.SamplingIntegrator):
@@ -45,7 +53,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
         self.secondary_samples = 1
         self.residual_probability = 0.0
         self.irradiance_filter = False
-        self.sampler = parameters.choice("sampler", "multijitter", SAMPLERS)
+        self.sampler = parameters.choice("sampler", "coherent", SAMPLERS)
         self.cache_file = parameters.text("cache_file")
         self._fingerprint = SceneFingerprint()
         self._prepared: Prepared | None = None
@@ -131,23 +139,38 @@ class CachedIntegrator(mi.SamplingIntegrator):
         self._seed = seed
         film = sensor.film()
         with dr.suspend_grad():
-            sampler = pixel_sampler(sensor, self.sampler, spp)
-            # What kernels read is put in place before the first one is recorded.
-            self.transport(scene, prepared, sampler.sample_count())
+            sampler, spp = self._pixel_sampler(sensor, spp)
+            transport = self.transport(scene, prepared, spp)
 
-            def shade(sampler, ray):
-                return self.radiance(scene, prepared, sampler, ray, True)
+            def shade(sampler, ray, index):
+                return camera_radiance(
+                    scene, transport.of_sample(index), sampler, ray, mi.Bool(True),
+                    self.secondary_samples,
+                )  # fmt: skip
 
             if self.irradiance_filter and self.residual_probability == 0:
-                n_samples = sampler.sample_count() * self.secondary_samples
-                expose_filtered(sensor, sampler, seed, shade, n_samples)
+                n_samples = spp * self.secondary_samples
+                expose_filtered(sensor, sampler, spp, seed, shade, n_samples)
             else:
-                expose(sensor, sampler, seed, shade, self.aov_names(), self.aovs)
+                expose(sensor, sampler, spp, seed, shade, self.aov_names(), self.aovs)
             picture = film.develop() if develop else mi.TensorXf()
             if evaluate:
                 film.schedule_storage()
                 dr.eval(picture)
         return picture
+
+    def _pixel_sampler(self, sensor: mi.Sensor, spp: int) -> tuple[mi.Sampler | None, int]:
+        """A sampler of Mitsuba's, None for our own points, and its samples per pixel.
+
+        The scene says how many if ``spp`` is 0. Samplers that stratify may round up to a full grid.
+        """
+        spp = spp or sensor.sampler().sample_count()
+        if self.sampler == "coherent":
+            return None, spp
+        own = self.sampler == "scene"
+        sampler = sensor.sampler().clone() if own else mi.load_dict({"type": self.sampler})
+        sampler.set_sample_count(spp)
+        return sampler, sampler.sample_count()
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
         found = self.radiance(scene, self.prepare(scene), sampler, ray, active)

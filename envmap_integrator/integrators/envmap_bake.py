@@ -40,8 +40,9 @@ class EnvmapBake(CachedIntegrator):
        - Shadow rays where a bake ray hits. (Default: 1)
      * - sampler
        - |string|
-       - One of Mitsuba's samplers, whatever the scene names, or ``scene`` for the scene's. Those
-         that stratify may round the samples per pixel up. (Default: multijitter)
+       - Sample points: ``coherent`` ones of our own, stratified in each pixel and much alike in
+         neighbouring ones, one of Mitsuba's samplers, or ``scene`` for the scene's. Mitsuba's may
+         round the samples per pixel up. (Default: coherent)
      * - cache_file
        - |string|
        - File with the baked state, from :monosp:`envmap-render bake`; unused when nested. (Default:

@@ -25,8 +25,9 @@ class SourceSelection(CachedIntegrator):
        - Shadow rays at a camera hit. (Default: 2)
      * - sampler
        - |string|
-       - One of Mitsuba's samplers, whatever the scene names, or ``scene`` for the scene's. Those
-         that stratify may round the samples per pixel up. (Default: multijitter)
+       - Sample points: ``coherent`` ones of our own, stratified in each pixel and much alike in
+         neighbouring ones, one of Mitsuba's samplers, or ``scene`` for the scene's. Mitsuba's may
+         round the samples per pixel up. (Default: coherent)
      * - cache_file
        - |string|
        - File with the baked state, from :monosp:`envmap-render bake`. (Default: none, bake now)

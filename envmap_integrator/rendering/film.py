@@ -1,147 +1,165 @@
-"""From camera samples to the film: passes over all pixels, and the filter of what they gather."""
+"""From camera samples to the film: all samples of a pixel, and the filter of what they gather."""
 
 from __future__ import annotations
+
+from operator import add
 
 import drjit as dr
 import mitsuba as mi
 
 from ..progress import stage
 from .irradiance_filter import Gathered, filter_irradiance, pixel_records, tolerance
+from .pixel_filter import PixelFilter
+from .sample_points import SamplePoints
 
-#: Camera rays per kernel launch, as Mitsuba has it. Within one launch nothing is stored for a ray;
-#: between launches, the samplers' states are.
-MAX_LANES = (1 << 32) - 1
-
-
-def pixel_sampler(sensor: mi.Sensor, plugin: str, spp: int) -> mi.Sampler:
-    """A sampler for ``spp`` samples per pixel, or as many as the scene asks for if that is 0.
-
-    ``plugin`` names it; ``scene`` stands for the sensor's own. Samplers that stratify may round the
-    number up to that of a full grid.
-    """
-    own = sensor.sampler()
-    spp = spp or own.sample_count()
-    sampler = own.clone() if plugin == "scene" else mi.load_dict({"type": plugin})
-    sampler.set_sample_count(spp)
-    return sampler
+#: Lanes of a render at least, where it has as many samples (fewer would leave threads idle), and at
+#: most, which is Dr.Jit's limit.
+MIN_LANES, MAX_LANES = 1 << 20, (1 << 32) - 1
 
 
-def expose(sensor: mi.Sensor, sampler: mi.Sampler, seed, shade, names: list[str], aovs) -> None:
+def expose(sensor, sampler, spp, seed, shade, names: list[str], aovs) -> None:
     """Render to the film of a sensor.
 
-    ``shade(sampler, ray)`` gives a ``CameraSample``, and ``aovs`` the values of it that are to go
-    to channels of the given ``names``.
-    """
-    film = sensor.film()
-    film.prepare(names)
-
-    def channels(found):
-        return found.radiance, aovs(found)
-
-    film.put_block(_accumulate(sensor, sampler, seed, shade, channels))
-
-
-def expose_filtered(sensor: mi.Sensor, sampler: mi.Sampler, seed, shade, n_samples: int) -> None:
-    """Render to the film of a sensor; pixels share what they gather with ``n_samples`` rays each.
-
-    ``shade(sampler, ray)`` gives a ``CameraSample``.
+    ``sampler`` is one of Mitsuba's, or None for our own sample points. ``shade(sampler, ray,
+    index)`` gives the ``CameraSample`` of the sample of that index, and ``aovs`` the values of it
+    that are to go to channels of the given ``names``.
     """
 
-    def channels(found):
-        return found.radiance - found.gathered.radiance, found.gathered.channels()
+    def channels(found, weight):
+        shown = _shown(sensor.film(), found.radiance, found.valid, weight)
+        return [*shown, *(weight * value for value in aovs(found))]
 
-    film = sensor.film()
+    sensor.film().prepare(names)
+    _put(sensor, _accumulate(sensor, sampler, spp, seed, shade, channels, len(names)))
+
+
+def expose_filtered(sensor, sampler, spp, seed, shade, n_samples: int) -> None:
+    """As ``expose``; pixels share what they gather with ``n_samples`` rays each."""
+
+    def channels(found, weight):
+        apart = found.radiance - found.gathered.radiance
+        shown = _shown(sensor.film(), apart, found.valid, weight)
+        return [*shown, *found.gathered.channels()]
+
     n_guides = Gathered.count()
-    film.prepare([f"gathered{i}" for i in range(n_guides)])
-    block = _accumulate(sensor, sampler, seed, shade, channels)
-    offset, (height, width, n_channels) = block.offset(), block.tensor().shape
-    n_shown = n_channels - n_guides
+    sums = _accumulate(sensor, sampler, spp, seed, shade, channels, n_guides)
     # These are the largest arrays of a render: none outlives its use.
-    shown = _channels(block, range(n_shown))
-    dr.eval(shown)
-    records = pixel_records(Gathered.of_channels(_channels(block, range(n_shown, n_channels))))
-    del block
-    film.prepare([])
+    records = pixel_records(Gathered.of_channels(sums[-n_guides:]))
+    del sums[-n_guides:]
     dr.flush_malloc_cache()
+    width = int(sensor.film().crop_size()[0])
     shared = filter_irradiance(records, width, tolerance(n_samples))
     for index, value in enumerate(_rgb(shared)):
-        shown[index] += value
-
-    picture = dr.empty(mi.Float, n_shown * height * width)
-    pixel = dr.arange(mi.UInt32, height * width)
-    for index, value in enumerate(shown):
-        dr.scatter(picture, value, pixel * n_shown + index)
-    film.put_block(mi.ImageBlock(mi.TensorXf(picture, (height, width, n_shown)), offset))
+        sums[index] += value
+    sensor.film().prepare([])
+    _put(sensor, sums)
 
 
-def _channels(block: mi.ImageBlock, which: range) -> list[mi.Float]:
-    """Some channels of all pixels, each [height * width]."""
-    tensor = block.tensor()
-    height, width, count = tensor.shape
-    first = dr.arange(mi.UInt32, height * width) * count
-    return [dr.gather(mi.Float, tensor.array, first + index) for index in which]
-
-
-def _accumulate(sensor, sampler, seed, shade, channels) -> mi.ImageBlock:
-    """Sums over the samples of each pixel, in the channels that the film has been prepared for.
-
-    ``channels(found)`` gives the radiance of a ``CameraSample`` that is shown, and the values of
-    further channels.
-    """
+def _put(sensor: mi.Sensor, sums: list[mi.Float]) -> None:
+    """Put sums over the samples of each pixel to a film that is prepared for them."""
     film = sensor.film()
+    width, height = (int(n) for n in film.crop_size())
+    picture = dr.empty(mi.Float, len(sums) * height * width)
+    first = len(sums) * dr.arange(mi.UInt32, height * width)
+    for index, value in enumerate(sums):
+        dr.scatter(picture, value, first + index)
+    tensor = mi.TensorXf(picture, (height, width, len(sums)))
+    film.put_block(mi.ImageBlock(tensor, film.crop_offset()))
+
+
+def _accumulate(sensor, sampler, spp, seed, shade, channels, n_further) -> list[mi.Float]:
+    """Sums over the samples of each pixel, row by row, of ``channels(found, weight)``."""
+    film = sensor.film()
+    pixel_filter = PixelFilter(film.rfilter())
     size = mi.ScalarVector2u(film.crop_size())
-    border = film.rfilter().border_size() if film.sample_border() else 0
-    size += 2 * border
-    spp = sampler.sample_count()
-    n_pixels = int(size[0]) * int(size[1])
-    n_passes = _passes(n_pixels, spp)
-    spp_per_pass = spp // n_passes
-    sampler.set_samples_per_wavefront(spp_per_pass)
-    sampler.seed(seed, n_pixels * spp_per_pass)
+    n_pixels, width = int(size[0]) * int(size[1]), dr.opaque(mi.UInt32, int(size[0]))
+    corner = mi.Vector2i(film.crop_offset())
 
-    block = film.create_block()
-    block.set_offset(film.crop_offset())
-    block.set_coalesce(block.coalesce() and spp_per_pass >= 4)
-    index = dr.arange(mi.UInt32, n_pixels * spp_per_pass) // dr.opaque(mi.UInt32, spp_per_pass)
-    width = dr.opaque(mi.UInt32, int(size[0]))
-    position = mi.Vector2i(index % width, index // width)
-    position += mi.Vector2i(film.crop_offset()) - border
-    with stage("Rendering", total=n_passes) as advance:
-        for _ in range(n_passes):
-            _pass(sensor, sampler, shade, channels, block, position)
-            if n_passes > 1:
-                sampler.advance()
-                sampler.schedule_state()
-                dr.eval(block.tensor())
-                dr.sync_thread()
-            advance(1)
-    return block
+    def values(sampler, pixel, index):
+        position = mi.Vector2i(pixel % width, pixel // width) + corner
+        return channels(*_sample(sensor, pixel_filter, sampler, shade, position, index))
+
+    with stage("Rendering"):
+        if sampler is None:
+            n_channels = len(_shown(film, mi.Spectrum(0), mi.Bool(True), mi.Float(1))) + n_further
+            sums = _lane_per_pixel(values, n_pixels, spp, seed, n_channels)
+        else:
+            sums = _lane_per_sample(values, n_pixels, spp, seed, sampler)
+        dr.eval(sums)
+        dr.sync_thread()
+    return sums
 
 
-def _passes(n_pixels: int, spp: int) -> int:
-    """The least number of equal passes that are small enough, if there can be."""
-    least = -(-n_pixels * spp // MAX_LANES)
-    return next(n for n in range(min(least, spp), spp + 1) if spp % n == 0)
+def _lane_per_pixel(values, n_pixels, spp, seed, n_channels):
+    """A lane takes the samples of one pixel in turn, or a part of them where pixels are few.
+
+    Nothing is stored for a sample, and neighbouring lanes are neighbouring pixels.
+    """
+    wanted = min(-(-MIN_LANES // n_pixels), spp)
+    parts = next(n for n in range(wanted, 0, -1) if spp % n == 0)
+    lane, n_pixels_ = dr.arange(mi.UInt32, n_pixels * parts), dr.opaque(mi.UInt32, n_pixels)
+    pixel, per_lane = lane % n_pixels_, dr.opaque(mi.UInt32, spp // parts)
+    first = lane // n_pixels_ * per_lane
+    points = SamplePoints.of(seed, pixel, spp, first)
+    sums = [dr.zeros(mi.Float, n_pixels * parts) for _ in range(n_channels)]
+    sums = _sums(values, points, pixel, first, per_lane, sums)
+    if parts == 1:
+        return sums
+    dr.eval(sums)
+    parts_ = dr.opaque(mi.UInt32, parts)
+    lanes_of_pixel = lane % parts_ * n_pixels_ + lane // parts_
+    return [dr.block_sum(dr.gather(mi.Float, part, lanes_of_pixel), parts) for part in sums]
 
 
-def _pass(sensor, sampler, shade, channels, block, position) -> None:
-    """One sample or several of each pixel."""
+@dr.syntax
+def _sums(values, points, pixel, first, count, sums):
+    i = mi.UInt32(0)
+    while dr.hint(i < count, label="Samples of a pixel"):
+        sums = [*map(add, sums, values(points, pixel, first + i))]
+        points.advance()
+        i += 1
+    return sums
+
+
+def _lane_per_sample(values, n_pixels, spp, seed, sampler):
+    """Mitsuba's samplers want the samples of a pixel side by side."""
+    n_lanes = n_pixels * spp
+    if n_lanes > MAX_LANES:
+        raise ValueError(
+            f"the sampler {sampler.class_name()} allows {MAX_LANES // n_pixels} samples per pixel "
+            f'of this film, not {spp}; leave "sampler" out to take as many as you like'
+        )
+    sampler.set_samples_per_wavefront(spp)
+    sampler.seed(seed, n_lanes)
+    index, spp_ = dr.arange(mi.UInt32, n_lanes), dr.opaque(mi.UInt32, spp)
+    pixel = index // spp_
+    sums = []
+    for value in values(sampler, pixel, index % spp_):
+        sums.append(dr.zeros(mi.Float, n_pixels))
+        dr.scatter_add(sums[-1], value, pixel)
+    return sums
+
+
+def _sample(sensor, pixel_filter, sampler, shade, position, index):
+    """The ``CameraSample`` of one sample of each pixel, weighted, and its weight in the pixel."""
     film = sensor.film()
-    place = mi.Vector2f(position) + sampler.next_2d()
+    offset, filter_weight = pixel_filter.sample(sampler.next_2d())
+    place = mi.Vector2f(position) + 0.5 + offset
     within = (place - mi.Vector2f(film.crop_offset())) / mi.Vector2f(film.crop_size())
     aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
     time = mi.Float(sensor.shutter_open())
     if sensor.shutter_open_time() > 0:
         time += sampler.next_1d() * sensor.shutter_open_time()
     ray, weight = sensor.sample_ray_differential(time, 0, within, aperture)
-    found = shade(sampler, mi.Ray3f(ray)).scaled(weight)
-    radiance, further = channels(found)
-    values = [*_rgb(radiance)]
-    if mi.has_flag(film.flags(), mi.FilmFlags.Alpha):
-        values.append(dr.select(found.valid, mi.Float(1), 0))
-    # With a box filter, a sample on the border of its pixel belongs there.
-    at = mi.Vector2f(position) if film.rfilter().is_box_filter() else place
-    block.put(at, [*values, mi.Float(1), *further])
+    found = shade(sampler, mi.Ray3f(ray), index)
+    return found.scaled(weight * filter_weight), filter_weight
+
+
+def _shown(film: mi.Film, radiance, valid, weight) -> list[mi.Float]:
+    """What every film holds: colour, alpha if wanted, and the weight of a sample."""
+    wanted = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
+    alpha = [dr.select(valid, weight, 0)] if wanted else []
+    return [*_rgb(radiance), *alpha, weight]
 
 
 def _rgb(radiance: mi.Spectrum) -> tuple[mi.Float, mi.Float, mi.Float]:

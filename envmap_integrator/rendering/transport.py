@@ -17,7 +17,7 @@ algorithm               gather_depth  maps
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -97,6 +97,11 @@ class Transport:
     hide_emitters: bool = False
     cache: IrradianceCache | None = None
     residual: Residual | None = None
+
+    def of_sample(self, index: mi.UInt32) -> Transport:
+        """The same; each sample of a pixel decides anew where residuals are estimated."""
+        residual = self.residual and replace(self.residual, seed=mix(self.residual.seed + index))
+        return replace(self, residual=residual)
 
 
 @dataclass
