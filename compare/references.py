@@ -53,9 +53,9 @@ def reference(view: View, spp: int, folder: Path) -> Reference:
     """Take the reference from ``folder``, or render it and leave it there."""
     path = folder / f"{view.name}-{view.content_hash()}-{spp}.exr"
     try:
-        parts, metadata = read(path, "")
-        halves = [np.stack([parts[half][c] for c in "RGB"], axis=2) for half in ("a", "b")]
-        return Reference(*halves, spp, metadata["part_means"])
+        stored = read(path, "render it again")
+        halves = [np.stack([stored.parts[half][c] for c in "RGB"], axis=2) for half in ("a", "b")]
+        return Reference(*halves, spp, stored.metadata["part_means"])
     except StorageError:
         pass
     result = _render(view, spp)

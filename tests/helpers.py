@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -102,6 +105,20 @@ def emitting(*radiance: float) -> Description:
 
 def colour(*value: float) -> Description:
     return {"type": "rgb", "value": list(value) if len(value) > 1 else value[0]}
+
+
+@contextmanager
+def unprivileged() -> Iterator[None]:
+    """Without the right of the superuser to ignore permissions, if that is who runs the tests."""
+    nobody = 65534
+    if os.getuid() != 0:
+        yield
+        return
+    os.setresuid(nobody, nobody, 0)
+    try:
+        yield
+    finally:
+        os.setresuid(0, 0, 0)
 
 
 def at(x: float, y: float, z: float) -> mi.ScalarTransform4f:

@@ -13,7 +13,8 @@ from rich.console import Console
 from rich.table import Table
 
 import envmap_integrator
-from envmap_integrator.cli.output import replacing, write_png
+from envmap_integrator.atomic import check_writable
+from envmap_integrator.cli.output import write_bitmap, write_png
 from envmap_integrator.cli.scene_file import SceneFile
 from envmap_integrator.cli.timing import compilation_time, measure, record_kernels
 from envmap_integrator.denoiser import denoise, warm_up
@@ -48,8 +49,7 @@ def render(args: argparse.Namespace) -> int:
     metadata["settings"] = json.dumps(settings)
     metadata["stage_times"] = json.dumps(seconds)
     metadata["compilation_time"] = compilation
-    with replacing(output) as temporary:
-        bitmap.write(str(temporary))
+    write_bitmap(output, bitmap)
     if args.png:
         write_png(output.with_suffix(".png"), bitmap)
     _report(seconds, compilation, output)
@@ -82,8 +82,7 @@ def bake(args: argparse.Namespace) -> int:
         state = scene.integrator().prepare(scene)
         seconds |= state.stage_times
         compilation = compilation_time()
-    with replacing(args.output) as temporary:
-        state.save(temporary)
+    state.save(args.output)
     _report(seconds, compilation, args.output)
     return 0
 
@@ -144,7 +143,7 @@ def _settings(
 def _check_output(path: Path) -> None:
     """Fail before the work starts rather than after it."""
     _require(path.suffix == ".exr", f'output "{path}" must end in .exr (--png adds a PNG)')
-    _require(path.parent.is_dir(), f'output folder "{path.parent}" does not exist: create it')
+    check_writable(path)
 
 
 def _require(condition: bool, message: str) -> None:

@@ -9,7 +9,7 @@ from ..checks import check_variant
 from ..jit import upload
 from ..maps.clusters import ClusterRequest
 from ..maps.cube import direction_to_face, face_to_direction, solid_angles, texel
-from ..maps.cube_map import from_parts
+from ..maps.cube_map import from_stored
 from ..parameters import Parameters
 from ..storage import StorageError, read
 
@@ -175,14 +175,17 @@ class MipmapCube(mi.Emitter):
 def _load(owner, filename, name):
     path = mi.file_resolver().resolve(filename)
     try:
-        parts, metadata = read(path, "make it with envmap-render bake")
-        maps = metadata["maps"]
-        known = [entry["name"] for entry in maps]
+        stored = read(path, "make it with envmap-render bake")
+        maps = stored.entries("maps")
+        known = [entry.text("name") for entry in maps]
         if name and name not in known:
-            raise StorageError(f'{path}: holds no map "{name}", only {", ".join(known) or "none"}')
+            raise StorageError(
+                f'{path}: holds no map "{name}", only {", ".join(known) or "none"}; name one of '
+                "these"
+            )
         if not maps:
             raise StorageError(f"{path}: holds no maps; its scene has no clusters")
         index = known.index(name) if name else 0
-        return from_parts(parts, maps[index], prefix=f"map{index}/")
+        return from_stored(maps[index], prefix=f"map{index}/")
     except StorageError as error:
         raise ValueError(f"{owner}: {error}") from None

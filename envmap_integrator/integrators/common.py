@@ -90,7 +90,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
         if self._prepared is None or self._prepared.key != key:
             check_scene(scene, self.owner)
             if self.cache_file:
-                self._prepared = load(self.cache_file, key, self.owner)
+                self._prepared = load(self.cache_file, key, self.owner, len(scene.emitters()))
             else:
                 with dr.suspend_grad():
                     self._prepared = prepare(scene, key, self.settings(), self.bake_with())
