@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import math
 import os
 import re
 from collections.abc import Callable
@@ -49,17 +48,14 @@ def write(path: str | os.PathLike, parts: Parts, metadata: dict) -> None:
         "displayWindow": _display_window(parts),
     }
     first = {ATTRIBUTE: json.dumps({"format": FORMAT, **metadata})}
-    exr_parts = [
-        OpenEXR.Part(header | (first if i == 0 else {}), channels, name=name)
+    exr_parts = [  # Which change the dictionaries that they are given.
+        OpenEXR.Part(header | (first if i == 0 else {}), dict(channels), name=name)
         for i, (name, channels) in enumerate(parts.items())
     ]
     with replacing(path) as file:
         OpenEXR.File(exr_parts).write(file)
         file.seek(0)
-        digest = hashlib.blake2b(digest_size=_DIGEST_SIZE)
-        while block := file.read(1 << 20):
-            digest.update(block)
-        file.write(digest.digest())
+        file.write(_digest(file.read()))
 
 
 def read(path: str | os.PathLike, made_by: str) -> Stored:
@@ -169,10 +165,13 @@ def _fault(content: bytes) -> str:
         return "damaged or not a file of envmap_integrator"
     if int(ours[1]) != FORMAT:
         return f"written in format {int(ours[1])}, this version reads format {FORMAT}"
-    kept, digest = content[:-_DIGEST_SIZE], content[-_DIGEST_SIZE:]
-    if hashlib.blake2b(kept, digest_size=_DIGEST_SIZE).digest() != digest:
+    if _digest(content[:-_DIGEST_SIZE]) != content[-_DIGEST_SIZE:]:
         return "truncated or damaged"
     return ""
+
+
+def _digest(content: bytes) -> bytes:
+    return hashlib.blake2b(content, digest_size=_DIGEST_SIZE).digest()
 
 
 def _parse(content: bytes) -> tuple[Parts, dict[str, Any]]:
@@ -199,7 +198,8 @@ def _claimed_size(headers: list[dict[str, Any]]) -> int:
 
 
 def _is_finite(value: Any) -> bool:
-    return type(value) in (int, float) and math.isfinite(value)
+    """Whether it's a number that Mitsuba can hold."""
+    return type(value) in (int, float) and bool(abs(value) <= np.finfo(np.float32).max)
 
 
 def _display_window(parts: Parts) -> tuple[np.ndarray, np.ndarray]:

@@ -184,7 +184,10 @@ def _load(owner, filename, name):
                 "these"
             )
         if not maps:
-            raise StorageError(f"{path}: holds no maps; its scene has no clusters")
+            raise StorageError(
+                f'{path}: holds no maps, its scene has no clusters; set "maps" to "always" or list a '
+                "cluster, and make it again with envmap-render bake"
+            )
         index = known.index(name) if name else 0
         return from_stored(maps[index], prefix=f"map{index}/")
     except StorageError as error:

@@ -59,12 +59,15 @@ def run(count: int, folder: Path, seed: int = 0, writers: int = 2) -> Counter:
         for _ in range(writers):
             child = os.fork()
             if child == 0:
-                keep_writing(path)
+                try:
+                    keep_writing(path)
+                finally:
+                    os._exit(1)
             children.append(child)
         time.sleep(random_.uniform(0, LATEST))
         for child in children:
             os.kill(child, signal.SIGKILL)
-            os.waitpid(child, 0)
+            assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
         tally["kills"] += 1
         tally["within a write"] += any(folder.glob(f"{PREFIX}*"))
         assert_whole(path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import struct
 import tracemalloc
 from contextlib import contextmanager
@@ -52,6 +51,13 @@ def test_what_was_written_is_read_to_the_bit(path):
         assert stored.parts[name].keys() == channels.keys()
         for channel, values in channels.items():
             assert stored.array(name, channel, values.dtype).tobytes() == values.tobytes()
+
+
+def test_what_is_written_stays_as_it_is(tmp_path):
+    ours = parts()
+    write(tmp_path / "first.exr", ours, METADATA)
+    write(tmp_path / "second.exr", ours, METADATA)
+    assert (tmp_path / "first.exr").read_bytes() == (tmp_path / "second.exr").read_bytes()
 
 
 def test_any_viewer_sees_the_parts(path):
@@ -152,7 +158,12 @@ def stored(**metadata) -> Stored:
         ("text", (), ["desk", ""], [1, None, ["desk"]]),
         ("flag", (), [True, False], [0, 1, "true", None]),
         ("integer", (1, 8), [1, 8], [0, 9, 2.0, True, "4", None, float("nan")]),
-        ("number", (), [0, 2, 0.5], [-1, float("nan"), float("inf"), True, "1", None]),
+        (
+            "number",
+            (),
+            [0, 2, 0.5],
+            [-1, float("nan"), float("inf"), 1e39, 10**400, True, "1", None],
+        ),
         ("point", (), [[1, -2.5, 0]], [[1, 2], [1, 2, float("nan")], [1, 2, "3"], 3, None]),
         ("numbers", (), [{"a": 1.5}, {}], [{"a": "b"}, {"a": None}, [1], None]),
         ("entries", (), [[], [{"a": 1}]], [[1], {"a": 1}, None]),
@@ -168,7 +179,7 @@ def test_values_are_checked(method, arguments, good, bad):
     for value in bad:
         with pytest.raises(StorageError, match=expected) as caught:
             getattr(stored(x=value), method)("x", *arguments)
-        assert repr(value) in str(caught.value)
+        assert repr(value)[:40] in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -186,7 +197,7 @@ def test_arrays_are_checked(part, channel, dtype):
 def sealed(content: bytes) -> bytes:
     """With the digest that belongs to the content before it, as a forger would leave it."""
     kept = content[: -storage._DIGEST_SIZE]
-    return kept + hashlib.blake2b(kept, digest_size=storage._DIGEST_SIZE).digest()
+    return kept + storage._digest(kept)
 
 
 def test_sizes_that_cannot_be_true_are_not_asked_for(path):
