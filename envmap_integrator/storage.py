@@ -199,7 +199,7 @@ def _claimed_size(headers: list[dict[str, Any]]) -> int:
 
 def _is_finite(value: Any) -> bool:
     """Whether it's a number that Mitsuba can hold."""
-    return type(value) in (int, float) and bool(abs(value) <= np.finfo(np.float32).max)
+    return type(value) in (int, float) and abs(value) <= float(np.finfo(np.float32).max)
 
 
 def _display_window(parts: Parts) -> tuple[np.ndarray, np.ndarray]:

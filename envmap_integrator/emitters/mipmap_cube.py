@@ -185,8 +185,8 @@ def _load(owner, filename, name):
             )
         if not maps:
             raise StorageError(
-                f'{path}: holds no maps, its scene has no clusters; set "maps" to "always" or list a '
-                "cluster, and make it again with envmap-render bake"
+                f'{path}: holds no maps, its scene has no clusters; set "maps" to "always" or list '
+                "a cluster, and make it again with envmap-render bake"
             )
         index = known.index(name) if name else 0
         return from_stored(maps[index], prefix=f"map{index}/")
