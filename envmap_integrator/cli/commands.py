@@ -61,7 +61,8 @@ def _denoise(bitmap: mi.Bitmap, scene: mi.Scene, settings: dict[str, object]) ->
     pixels = np.array(bitmap, copy=False)
     _require(
         pixels.ndim == 3 and pixels.shape[2] >= 3,
-        '--denoise needs colour: set the film\'s "pixel_format" to rgb or rgba',
+        f"--denoise needs colour, the film has {pixels[0, 0].size} channel(s): set its "
+        '"pixel_format" to rgb or rgba',
     )
     spp, seed, sensor = (settings[key] for key in ("spp", "seed", "sensor"))
     pixels[:, :, :3] = denoise(scene, pixels[:, :, :3], spp, seed, sensor)
@@ -118,7 +119,8 @@ def _sensor(scene: mi.Scene, index: int) -> mi.Sensor:
     sensors = scene.sensors()
     _require(
         0 <= index < len(sensors),
-        f"-s/--sensor {index} is out of range: the scene has {len(sensors)} sensor(s)",
+        f"-s/--sensor {index} is out of range: the scene has {len(sensors)} sensor(s), the first "
+        "is 0",
     )
     return sensors[index]
 

@@ -56,7 +56,8 @@ class MipmapCube(mi.Emitter):
         filename = parameters.text("filename")
         if bool(shapes) == bool(filename):
             raise ValueError(
-                f'{parameters.owner}: give either "filename" (a baked map) or "shapes" (a cluster)'
+                f'{parameters.owner}: give either "filename" (a baked map) or "shapes" (a '
+                f"cluster), not {'both' if shapes else 'neither'}"
             )
         if shapes:
             names = tuple(name.strip() for name in shapes.split(",") if name.strip())
