@@ -37,7 +37,8 @@ def render(args: argparse.Namespace) -> int:
         if hasattr(scene.integrator(), "prepare"):
             seconds |= scene.integrator().prepare(scene).stage_times
         with measure(seconds, "render"):
-            dr.eval(mi.render(scene, sensor=sensor, seed=args.seed, spp=args.spp))
+            # Not mi.render, which would make another exception of Ctrl-C.
+            dr.eval(scene.integrator().render(scene, sensor, seed=args.seed, spp=args.spp))
         bitmap = sensor.film().bitmap()
         if args.denoise:
             with measure(seconds, "denoise"):

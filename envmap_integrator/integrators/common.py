@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from ..checks import check_scene, check_variant
 from ..fingerprint import SceneFingerprint
+from ..interrupt import interruptible
 from ..parameters import Parameters
 from ..pipeline import Prepared, Settings, load, prepare
 from ..radiosity.surface_points import ObjectIds
@@ -92,7 +93,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
             if self.cache_file:
                 self._prepared = load(self.cache_file, key, self.owner, len(scene.emitters()))
             else:
-                with dr.suspend_grad():
+                with interruptible(), dr.suspend_grad():
                     self._prepared = prepare(scene, key, self.settings(), self.bake_with())
         return self._prepared
 
@@ -130,7 +131,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
         prepared = self.prepare(scene)
         self._seed = seed
         film = sensor.film()
-        with dr.suspend_grad():
+        with interruptible(), dr.suspend_grad():
             sampler = pixel_sampler(sensor, self.sampler, spp)
             # What kernels read is put in place before the first one is recorded.
             self.transport(scene, prepared, sampler.sample_count())
