@@ -15,7 +15,7 @@ from tests.helpers import ROOT
 #: Seconds that a process may take to end, and more for a machine that is busy.
 LIMIT, TOLERANCE = 2.0, 1.0
 #: Of pre-passes and renders that last for minutes.
-PATCHES, SPP = 1 << 18, 1 << 16
+PATCHES, SPP = 1 << 18, 1 << 12
 
 # ---------------------- From Python ----------------------
 
@@ -34,7 +34,7 @@ expected = renderer.render(scene, spp=1).numpy()
 big = integrator("envmap_hybrid", desk=cluster(), patches={PATCHES})
 stages = {{
     "prepare": lambda: big.prepare(scene),
-    "render": lambda: renderer.render(scene, spp={SPP}).numpy(),
+    "render": lambda: renderer.render(scene, spp={16 * SPP}).numpy(),
 }}
 
 def press():
