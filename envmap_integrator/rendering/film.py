@@ -5,6 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..interrupt import going_on
 from ..progress import stage
 from .irradiance_filter import Gathered, filter_irradiance, tolerance
 
@@ -114,7 +115,20 @@ def _passes(n_pixels: int, spp: int) -> int:
 
 
 def _pass(sensor, sampler, shade, channels, block, position) -> None:
-    """One sample or several of each pixel."""
+    """One sample or several of each pixel, unless Ctrl-C has been pressed."""
+
+    def trace(sampler, position):
+        _trace(sensor, sampler, shade, channels, block, position)
+        return sampler, position
+
+    def leave(sampler, position):
+        return sampler, position
+
+    lane = dr.arange(mi.UInt32, dr.width(position))
+    dr.if_stmt((sampler, position), going_on(lane), trace, leave, mode="symbolic")
+
+
+def _trace(sensor, sampler, shade, channels, block, position) -> None:
     film = sensor.film()
     place = mi.Vector2f(position) + sampler.next_2d()
     within = (place - mi.Vector2f(film.crop_offset())) / mi.Vector2f(film.crop_size())
