@@ -19,6 +19,7 @@ from .maps.clusters import (
     worthwhile,
 )
 from .maps.cube_map import CubeMap, from_stored, to_parts
+from .memory import check_memory
 from .radiosity.direct_light import choose_sources, survey_direct_light
 from .radiosity.evenness import drop_uneven
 from .radiosity.irradiance import IrradianceCache, solve_irradiance
@@ -31,6 +32,9 @@ from .storage import StorageError, Stored, read, write
 
 #: Surface points per patch of the budget.
 POINTS_PER_PATCH = 16
+#: Memory [bytes] taken at most by a patch of the budget, by each of its gather rays, and by each of
+#: the finest texels of a map, while they are made (measured).
+PATCH_MEMORY, RAY_MEMORY, TEXEL_MEMORY = 9000, 40, 130
 
 
 @dataclass(frozen=True)
@@ -74,8 +78,17 @@ class Prepared:
         save(path, self)
 
 
-def prepare(scene: mi.Scene, key: str, settings: Settings, baker=None) -> Prepared:
-    """Run the pre-passes. ``baker`` is the ``envmap_bake`` that fills the maps."""
+def prepare(scene: mi.Scene, key: str, settings: Settings, owner: str, baker=None) -> Prepared:
+    """Run the pre-passes. ``baker`` is the ``envmap_bake`` that fills the maps.
+
+    Raises ``ValueError``, in the name of ``owner``, if there is too little memory for the settings.
+    """
+    check_memory(
+        owner,
+        f"{settings.patches} patches with {settings.patch_samples} samples each",
+        settings.patches * (PATCH_MEMORY + RAY_MEMORY * settings.patch_samples),
+        'lower "patches" or "patch_samples"',
+    )
     times: dict[str, float] = {}
 
     with _timed(times, "coarse mesh"):
@@ -120,9 +133,16 @@ def prepare(scene: mi.Scene, key: str, settings: Settings, baker=None) -> Prepar
             len(clusters), cluster_of_point, cell_of_point, dr.width(patches.levels)
         )
 
+    resolution = settings.map_resolution
+    check_memory(
+        owner,
+        f"{len(clusters)} maps of {resolution} x {resolution} texels a face",
+        len(clusters) * 6 * resolution**2 * TEXEL_MEMORY,
+        'lower "map_resolution" or list fewer clusters',
+    )
     with _timed(times, "maps"):
         members = [points.take(np.flatnonzero(cluster_of_point == i)) for i in range(len(clusters))]
-        maps = baker.bake(scene, prepared, clusters, members, settings.map_resolution)
+        maps = baker.bake(scene, prepared, clusters, members, resolution)
     return replace(prepared, maps=maps, cluster_of_cell=membership)
 
 

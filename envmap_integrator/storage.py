@@ -20,6 +20,7 @@ import numpy as np
 import OpenEXR
 
 from .atomic import StorageError, replacing
+from .memory import free_memory
 
 #: EXR attribute that holds our metadata, as JSON.
 ATTRIBUTE = "envmap_integrator"
@@ -66,8 +67,19 @@ def read(path: str | os.PathLike, made_by: str) -> Stored:
     """
     path = Path(str(path))  # Mitsuba's own paths aren't os.PathLike.
     try:
+        return _read(path, made_by)
+    except MemoryError:
+        raise StorageError(
+            f"{path}: needs more memory than the {free_memory() / 1e9:.1f} GB that are free; close "
+            f"other programs, or {made_by}"
+        ) from None
+
+
+def _read(path: Path, made_by: str) -> Stored:
+    try:
         if not path.is_file():
             raise StorageError(f"{path}: no such file; {made_by}")
+        _ask_for_memory(path.stat().st_size)
         content = path.read_bytes()
     except OSError as error:
         reason = f"can't be read: {error.strerror}; mend that, or {made_by}"
@@ -176,9 +188,10 @@ def _digest(content: bytes) -> bytes:
 
 def _parse(content: bytes) -> tuple[Parts, dict[str, Any]]:
     with OpenEXR.File(io.BytesIO(content), separate_channels=True, header_only=True) as file:
-        # Memory is asked for only if there can be that much to put there.
-        if _claimed_size([part.header for part in file.parts]) > _COMPRESSION * len(content):
+        size = _claimed_size([part.header for part in file.parts])
+        if size > _COMPRESSION * len(content):
             raise ValueError("sizes that can't be true")
+        _ask_for_memory(size)
         metadata = json.loads(file.parts[0].header[ATTRIBUTE])
     with OpenEXR.File(io.BytesIO(content), separate_channels=True) as file:
         parts = {
@@ -186,6 +199,11 @@ def _parse(content: bytes) -> tuple[Parts, dict[str, Any]]:
             for part in file.parts
         }
     return parts, dict(metadata)
+
+
+def _ask_for_memory(size: int) -> None:
+    if size > free_memory():
+        raise MemoryError
 
 
 def _claimed_size(headers: list[dict[str, Any]]) -> int:

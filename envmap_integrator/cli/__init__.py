@@ -35,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print(_INTERRUPTED, file=sys.stderr)
         return EXIT_INTERRUPTED
-    except (ValueError, TypeError, RuntimeError, ImportError, OSError) as error:
+    except (ValueError, TypeError, RuntimeError, ImportError, OSError, MemoryError) as error:
         if args.debug:
             raise
         print(f"envmap-render: {condense(error)}", file=sys.stderr)

@@ -94,7 +94,9 @@ class CachedIntegrator(mi.SamplingIntegrator):
                 self._prepared = load(self.cache_file, key, self.owner, len(scene.emitters()))
             else:
                 with interruptible(), dr.suspend_grad():
-                    self._prepared = prepare(scene, key, self.settings(), self.bake_with())
+                    self._prepared = prepare(
+                        scene, key, self.settings(), self.owner, self.bake_with()
+                    )
         return self._prepared
 
     def transport_from(self, scene: mi.Scene, prepared: Prepared, **more) -> Transport:

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 import envmap_integrator
-from envmap_integrator import storage
+from envmap_integrator import memory, storage
 from envmap_integrator.atomic import check_writable, replacing
 from envmap_integrator.checks import check_scene, check_variant
 from envmap_integrator.cli import commands
@@ -33,11 +33,14 @@ from tests.unit.kit import surface_points
 pytestmark = pytest.mark.usefixtures("variant")
 
 PACKAGE = Path(envmap_integrator.__file__).parent
-#: What isn't a message for users: an abstract method, an error raised on, and one that is caught.
+#: What isn't a message for users: an abstract method, errors raised on, and those that are caught.
 EXCEPTED = {
     "raise NotImplementedError",
     "raise",
     """raise ValueError("sizes that can't be true")""",
+    "raise MemoryError",
+    "raise error",
+    "raise KeyboardInterrupt from error",
 }
 MEDIUM = {"type": "homogeneous", "albedo": 0.5, "sigma_t": 1.0}
 #: Of small pieces, so that a change of a file's content is quick.
@@ -196,6 +199,15 @@ def old_llvm(s: Surroundings) -> None:
     ensure_llvm()
 
 
+def little_memory(action: Callable, free: float = 1e9) -> Callable:
+    def run(s):
+        for module in (memory, storage):
+            s.patch.setattr(module, "free_memory", lambda: free)
+        action(s)
+
+    return run
+
+
 def other_variant(s: Surroundings) -> None:
     s.patch.setattr(mi, "variant", lambda: "scalar_rgb")
     check_variant("envmap_hybrid")
@@ -271,7 +283,25 @@ CASES = {
     "variant": Case(other_variant, "envmap_hybrid", "variant scalar_rgb", "use one of llvm_ad_rgb"),
     "llvm": Case(old_llvm, "llvm_* variants", "LLVM 15", "need LLVM 17 or newer: "),
     "denoiser": Case(without_denoiser, "the denoiser", "is missing", "pip install mitsuba-oidn"),
+    "patches": Case(
+        little_memory(lambda s: integrator("envmap_hybrid", patches=10**6).prepare(load(room()))),
+        "envmap_hybrid", "1000000 patches with 32 samples each need 10.3 GB, 1.0 GB are free",
+        'lower "patches" or "patch_samples"',
+    ),
+    "maps": Case(
+        little_memory(
+            lambda s: integrator("envmap_hybrid", **SETTINGS | {"map_resolution": 2048}).prepare(
+                load(room())
+            )
+        ),
+        "envmap_hybrid", "1 maps of 2048 x 2048 texels a face need 3.3 GB, 1.0 GB are free",
+        'lower "map_resolution" or list fewer clusters',
+    ),
     # ---- Files that are read ----
+    "a large file": Case(
+        little_memory(use(lambda s: s.state), 1000), '"cache_file" {state}', "0.0 GB that are free",
+        "close other programs",
+    ),
     "no file": Case(use(lambda s: s.folder / "none.exr"), "none.exr", "no such file", AGAIN),
     "unreadable": Case(read_hidden, "{public}/state.exr", "Permission denied", "make it again"),
     "damaged": Case(use(with_bytes(lambda b: b[:-9])), STATE, "truncated or damaged", AGAIN),
