@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 import tracemalloc
-from contextlib import contextmanager
 
 import mitsuba as mi
 import numpy as np
@@ -13,7 +12,7 @@ import pytest
 
 from envmap_integrator import storage
 from envmap_integrator.storage import StorageError, Stored, read, write
-from tests.helpers import unprivileged
+from tests.helpers import at_most, unprivileged
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -253,18 +252,6 @@ def test_a_disk_that_is_full(tmp_path):
         assert files_in(tmp_path) == [path.name]
     with at_most(size):
         write(path, parts(), METADATA)
-
-
-@contextmanager
-def at_most(size: int):
-    """No file may grow larger than ``size`` bytes."""
-    resource = pytest.importorskip("resource")
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (int(size), limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 def test_files_can_be_read_by_others(path):
