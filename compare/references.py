@@ -57,9 +57,9 @@ def reference(view: View, spp: int, folder: Path) -> Reference:
     """Take the reference from ``folder``, or render it and leave it there."""
     path = folder / f"{view.name}-{view.content_hash()}-{spp}.exr"
     try:
-        parts, metadata = read(path, "")
-        thirds = [np.stack([parts[third][c] for c in "RGB"], axis=2) for third in THIRDS]
-        return Reference(tuple(thirds), spp, metadata["part_means"])
+        stored = read(path, "render it again")
+        thirds = [np.stack([stored.parts[third][c] for c in "RGB"], axis=2) for third in THIRDS]
+        return Reference(tuple(thirds), spp, stored.metadata["part_means"])
     except StorageError:
         pass
     result = _render(view, spp)

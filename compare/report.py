@@ -20,7 +20,8 @@ from rich.table import Table as RichTable
 import envmap_integrator
 from compare.figures import exposure, png, srgb
 from compare.metrics import Picture
-from envmap_integrator.cli.output import replacing
+from envmap_integrator.atomic import replacing
+from envmap_integrator.cli.output import write_bitmap
 
 SCHEMA = 1
 """Version of the JSON files' layout."""
@@ -88,11 +89,11 @@ def write(report: Report, folder: Path) -> None:
     _write_text(folder / f"{report.name}.json", json.dumps(_document(report), indent=1) + "\n")
     images = [(illustration, png(illustration.figure)) for illustration in report.figures]
     for illustration, data in images:
-        with replacing(folder / f"{report.name}-{illustration.name}.png") as temporary:
-            temporary.write_bytes(data)
+        with replacing(folder / f"{report.name}-{illustration.name}.png") as file:
+            file.write(data)
     for name, picture in report.pictures.items():
-        with replacing(folder / f"{report.name}-{name}.exr") as temporary:
-            mi.Bitmap(np.ascontiguousarray(picture, np.float32)).write(str(temporary))
+        bitmap = mi.Bitmap(np.ascontiguousarray(picture, np.float32))
+        write_bitmap(folder / f"{report.name}-{name}.exr", bitmap)
     _write_text(folder / f"{report.name}.html", _html(report, images))
 
 
@@ -175,5 +176,5 @@ def _embed(data: bytes) -> str:
 
 
 def _write_text(path: Path, text: str) -> None:
-    with replacing(path) as temporary:
-        temporary.write_text(text)
+    with replacing(path) as file:
+        file.write(text.encode())

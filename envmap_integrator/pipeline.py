@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -18,19 +18,23 @@ from .maps.clusters import (
     listed_clusters,
     worthwhile,
 )
-from .maps.cube_map import CubeMap, from_parts, to_parts
+from .maps.cube_map import CubeMap, from_stored, to_parts
+from .memory import check_memory
 from .radiosity.direct_light import choose_sources, survey_direct_light
 from .radiosity.evenness import drop_uneven
 from .radiosity.irradiance import IrradianceCache, solve_irradiance
-from .radiosity.patches import Patches, build_patches
+from .radiosity.patches import BUCKET, Patches, build_patches
 from .radiosity.spaces import find_spaces, separate
 from .radiosity.surface_points import ObjectIds, scatter_points
 from .rendering.source_choice import Emitters
 from .rendering.transport import Transport
-from .storage import StorageError, read, write
+from .storage import StorageError, Stored, read, write
 
 #: Surface points per patch of the budget.
 POINTS_PER_PATCH = 24
+#: Memory [bytes] taken at most by a patch of the budget, by each of its gather rays, and by each of
+#: the finest texels of a map, while they are made (measured).
+PATCH_MEMORY, RAY_MEMORY, TEXEL_MEMORY = 9000, 40, 130
 
 
 @dataclass(frozen=True)
@@ -74,8 +78,17 @@ class Prepared:
         save(path, self)
 
 
-def prepare(scene: mi.Scene, key: str, settings: Settings, baker=None) -> Prepared:
-    """Run the pre-passes. ``baker`` is the ``envmap_bake`` that fills the maps."""
+def prepare(scene: mi.Scene, key: str, settings: Settings, owner: str, baker=None) -> Prepared:
+    """Run the pre-passes. ``baker`` is the ``envmap_bake`` that fills the maps.
+
+    Raises ``ValueError``, in the name of ``owner``, if there is too little memory for the settings.
+    """
+    check_memory(
+        owner,
+        f"{settings.patches} patches with {settings.patch_samples} samples each",
+        settings.patches * (PATCH_MEMORY + RAY_MEMORY * settings.patch_samples),
+        'lower "patches" or "patch_samples"',
+    )
     times: dict[str, float] = {}
 
     with _timed(times, "coarse mesh"):
@@ -120,9 +133,16 @@ def prepare(scene: mi.Scene, key: str, settings: Settings, baker=None) -> Prepar
             len(clusters), cluster_of_point, cell_of_point, dr.width(patches.levels)
         )
 
+    resolution = settings.map_resolution
+    check_memory(
+        owner,
+        f"{len(clusters)} maps of {resolution} x {resolution} texels a face",
+        len(clusters) * 6 * resolution**2 * TEXEL_MEMORY,
+        'lower "map_resolution" or list fewer clusters',
+    )
     with _timed(times, "maps"):
         members = [points.take(np.flatnonzero(cluster_of_point == i)) for i in range(len(clusters))]
-        maps = baker.bake(scene, prepared, clusters, members, settings.map_resolution)
+        maps = baker.bake(scene, prepared, clusters, members, resolution)
     return replace(prepared, maps=maps, cluster_of_cell=membership)
 
 
@@ -185,43 +205,86 @@ def save(path, prepared: Prepared) -> None:
     write(path, parts, metadata)
 
 
-def load(path, key: str, owner: str) -> Prepared:
-    """Read a prepared state; ``ValueError`` if the file holds none that belongs to ``key``."""
+def load(path, key: str, owner: str, n_emitters: int) -> Prepared:
+    """Read a prepared state; ``ValueError`` if the file holds none that belongs to ``key``.
+
+    ``n_emitters`` is the number of emitters of the scene.
+    """
     path = mi.file_resolver().resolve(path)
     try:
-        parts, metadata = read(path, "make it with envmap-render bake")
-        if metadata.get("key") != key:
-            raise StorageError(
-                f"{path}: made for another scene or other settings; bake it again with "
-                "envmap-render bake"
-            )
-        maps = tuple(
-            from_parts(parts, map_metadata, prefix=f"map{index}/")
-            for index, map_metadata in enumerate(metadata["maps"])
-        )
+        return _prepared(read(path, "make it again with envmap-render bake"), key, n_emitters)
     except StorageError as error:
         raise ValueError(f'{owner}: "cache_file" {error}') from None
 
-    n_patches = metadata["patches"]
 
-    def values(part, channel, n):
-        return parts[part][channel].ravel()[:n]
+def _prepared(stored: Stored, key: str, n_emitters: int) -> Prepared:
+    difference = _difference(stored.text("key"), key)
+    if difference:
+        raise stored.refusal(difference)
 
+    def values(part, channel, dtype, count):
+        found = stored.array(part, channel, dtype).ravel()[:count]
+        if len(found) < count:
+            raise stored.refusal(f'its part "{part}" holds {len(found)} values of {count}')
+        return found
+
+    n_cells = stored.integer("levels", BUCKET)
+    n_patches = stored.integer("patches", BUCKET)
+    n_channels = len(mi.Spectrum())
     patches = Patches(
-        origin=opaque_point(metadata["origin"]),
-        size=dr.opaque(mi.Float, metadata["size"]),
-        levels=upload(mi.UInt32, values("levels", "entry", metadata["levels"])),
-        cells=upload(mi.UInt32, values("patches", "fingerprint", n_patches)),
-        use_objects=metadata["use_objects"],
+        origin=opaque_point(stored.point("origin")),
+        size=dr.opaque(mi.Float, stored.number("size")),
+        levels=upload(mi.UInt32, values("levels", "entry", np.uint32, n_cells)),
+        cells=upload(mi.UInt32, values("patches", "fingerprint", np.uint32, n_patches)),
+        use_objects=stored.flag("use_objects"),
     )
-    table = upload(mi.Float, values("irradiance", "Y", 2 * n_patches * metadata["channels"]))
-    sources = upload(mi.Float, values("sources", "alias", metadata["sources"]))
-    source_rows = upload(mi.UInt32, values("source_rows", "row", metadata["source_rows"]))
+    table = values("irradiance", "Y", np.float32, 2 * n_patches * n_channels)
+
+    # What kernels look up has to be there: they don't check.
+    n_sources = stored.integer("sources", 4 * n_emitters)
+    sources = values("sources", "alias", np.float32, n_sources)
+    rows = values("source_rows", "row", np.uint32, stored.integer("source_rows", 1))
+    other = sources[1::4]
+    n_rows = n_sources // (4 * n_emitters)
+    if rows.max() >= n_rows or not np.all((other >= 0) & (other < n_emitters)):
+        raise stored.refusal(f"its sources aren't {n_rows} rows for {n_emitters} emitters")
+    maps = tuple(
+        from_stored(entry, prefix=f"map{index}/")
+        for index, entry in enumerate(stored.entries("maps"))
+    )
+    if any(cube_map.n_channels != n_channels for cube_map in maps):
+        raise stored.refusal(f"its maps haven't {n_channels} colour channels")
     membership = None
-    if "cluster_of_cell" in parts:
-        membership = values("cluster_of_cell", "cluster", metadata["levels"])
-    cache = IrradianceCache(patches, table)
-    return Prepared(key, cache, sources, source_rows, maps, membership, metadata["stage_times"])
+    if maps or "cluster_of_cell" in stored.parts:
+        membership = values("cluster_of_cell", "cluster", np.uint32, n_cells)
+        if membership.max() > len(maps):
+            raise stored.refusal(f"its clusters are more than its {len(maps)} maps")
+    return Prepared(
+        stored.text("key"),
+        IrradianceCache(patches, upload(mi.Float, table)),
+        upload(mi.Float, sources),
+        upload(mi.UInt32, rows),
+        maps,
+        membership,
+        stored.numbers("stage_times"),
+    )
+
+
+def _difference(theirs: str, ours: str) -> str:
+    """What tells the key of a state (``Prepared.key``) from ours, in words; nothing if they agree.
+
+    A key is a scene's hash and the text of ``Settings``.
+    """
+    if theirs == ours:
+        return ""
+    (scene, settings), (our_scene, our_settings) = (k.partition(" ")[::2] for k in (theirs, ours))
+    if scene != our_scene:
+        return "made for another scene or variant"
+    last = len(fields(Settings)) - 1
+    each = (text.split(", ", last) for text in (settings, our_settings))
+    pairs = ((a, b) for a, b in zip(*each, strict=False) if a != b)
+    a, b = (text.removeprefix("Settings(") for text in next(pairs, (settings, our_settings)))
+    return f"made with {a}, not {b}"
 
 
 def _image(values: np.ndarray) -> np.ndarray:

@@ -1,90 +1,226 @@
-"""Named arrays with metadata in multi-part OpenEXR files that any viewer opens."""
+"""Named arrays with metadata in multi-part OpenEXR files that any viewer opens.
+
+Each file ends with a digest of all that comes before it, which viewers ignore. Nothing is made of a
+file unless that is right: OpenEXR doesn't survive every damage.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenEXR
 
+from .atomic import StorageError, replacing
+from .memory import free_memory
+
 #: EXR attribute that holds our metadata, as JSON.
 ATTRIBUTE = "envmap_integrator"
-FORMAT = 2
+FORMAT = 3
+
+_MAGIC = b"v/1\x01"
+#: The attribute as it lies in a file, within its first bytes; so it began in every format.
+_ATTRIBUTE_BYTES = re.compile(ATTRIBUTE.encode() + rb'\0string\0....\{"format": (\d+)', re.DOTALL)
+_HEADER = 1 << 16
+_DIGEST_SIZE = 16
+#: Deflate makes nothing smaller by more than this.
+_COMPRESSION = 1032
 
 Parts = dict[str, dict[str, np.ndarray]]
-
-
-class StorageError(ValueError):
-    """A file that can't be read or isn't what it should be; the message is one line."""
 
 
 def write(path: str | os.PathLike, parts: Parts, metadata: dict) -> None:
     """Write parts (name → channel → [H, W] array of float32 or uint32) and metadata.
 
-    The file appears under its name only when it's complete.
+    The file appears under its name only when it's complete. Raises ``StorageError`` if it can't be
+    written.
     """
-    path = Path(path)
-    metadata = {"format": FORMAT, "checksum": _checksum(parts), **metadata}
     header = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
         "displayWindow": _display_window(parts),
     }
-    exr_parts = [
-        OpenEXR.Part(
-            header | ({ATTRIBUTE: json.dumps(metadata)} if i == 0 else {}), channels, name=name
-        )
+    first = {ATTRIBUTE: json.dumps({"format": FORMAT, **metadata})}
+    exr_parts = [  # Which change the dictionaries that they are given.
+        OpenEXR.Part(header | (first if i == 0 else {}), dict(channels), name=name)
         for i, (name, channels) in enumerate(parts.items())
     ]
-    if not path.parent.is_dir():
-        raise StorageError(f"{path}: there is no folder {path.parent}; make it first")
-    temporary = path.with_name(f".{path.stem}-{os.getpid()}.exr")
-    try:
-        OpenEXR.File(exr_parts).write(str(temporary))
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(path) as file:
+        OpenEXR.File(exr_parts).write(file)
+        file.seek(0)
+        file.write(_digest(file.read()))
 
 
-def read(path: str | os.PathLike, made_by: str) -> tuple[Parts, dict]:
+def read(path: str | os.PathLike, made_by: str) -> Stored:
     """Read what ``write`` has written.
 
-    Raises ``StorageError`` if the file is missing, truncated or none of ours; ``made_by`` tells
-    the user where such files come from.
+    Raises ``StorageError`` if the file is missing, damaged, of another format or none of ours;
+    ``made_by`` tells the user where such files come from.
     """
     path = Path(str(path))  # Mitsuba's own paths aren't os.PathLike.
-    if not path.is_file():
-        raise StorageError(f"{path}: no such file; {made_by}")
     try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            metadata = json.loads(file.parts[0].header[ATTRIBUTE])
-            parts = {
-                part.name(): {name: channel.pixels for name, channel in part.channels.items()}
-                for part in file.parts
-            }
-            complete = metadata["format"] == FORMAT and metadata["checksum"] == _checksum(parts)
-    except KeyError:
-        raise StorageError(f"{path}: not a file of envmap_integrator; {made_by}") from None
-    except (RuntimeError, TypeError, ValueError, AttributeError) as error:
-        raise StorageError(f"{path}: damaged or no OpenEXR file; {made_by}") from error
-    if not complete:
-        raise StorageError(f"{path}: truncated or damaged; {made_by}")
-    return parts, metadata
+        return _read(path, made_by)
+    except MemoryError:
+        raise StorageError(
+            f"{path}: needs more memory than the {free_memory() / 1e9:.1f} GB that are free; close "
+            f"other programs, or {made_by}"
+        ) from None
+
+
+def _read(path: Path, made_by: str) -> Stored:
+    try:
+        if not path.is_file():
+            raise StorageError(f"{path}: no such file; {made_by}")
+        _ask_for_memory(path.stat().st_size)
+        content = path.read_bytes()
+    except OSError as error:
+        reason = f"can't be read: {error.strerror}; mend that, or {made_by}"
+        raise StorageError(f"{path}: {reason}") from error
+    fault = _fault(content)
+    if fault:
+        raise StorageError(f"{path}: {fault}; {made_by}")
+    try:
+        parts, metadata = _parse(content)
+    except (RuntimeError, TypeError, ValueError, KeyError, AttributeError) as error:
+        raise StorageError(f"{path}: not as this version writes files; {made_by}") from error
+    return Stored(parts, metadata, str(path), made_by)
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What a file holds. Everything is checked as it's taken; complaints name file and value.
+
+    parts      name → channel → [H, W] array
+    metadata   values by name
+    path       of the file
+    made_by    tells the user where such files come from
+    """
+
+    parts: Parts
+    metadata: dict[str, Any]
+    path: str
+    made_by: str
+
+    def refusal(self, reason: str) -> StorageError:
+        """The error to raise for a fault of the file."""
+        return StorageError(f"{self.path}: {' '.join(reason.split())}; {self.made_by}")
+
+    def array(self, part: str, channel: str, dtype: type) -> np.ndarray:
+        """A channel [H, W] of float32 or uint32."""
+        image = self.parts.get(part, {}).get(channel)
+        if image is None or image.dtype != dtype:
+            raise self.refusal(f'holds no part "{part}" with {np.dtype(dtype)} values "{channel}"')
+        return image
+
+    def text(self, name: str) -> str:
+        return self._value(name, "a string", lambda value: isinstance(value, str))
+
+    def flag(self, name: str) -> bool:
+        return self._value(name, "true or false", lambda value: isinstance(value, bool))
+
+    def integer(self, name: str, low: int, high: int = 2**31 - 1) -> int:
+        return self._value(
+            name,
+            f"an integer of {low} to {high}",
+            lambda value: type(value) is int and low <= value <= high,
+        )
+
+    def number(self, name: str) -> float:
+        """A number that isn't negative."""
+        return self._value(name, "a number of at least 0", lambda v: _is_finite(v) and v >= 0)
+
+    def point(self, name: str) -> list[float]:
+        return self._value(
+            name,
+            "three numbers",
+            lambda v: isinstance(v, list) and len(v) == 3 and all(map(_is_finite, v)),
+        )
+
+    def numbers(self, name: str) -> dict[str, float]:
+        """Numbers by name."""
+        return self._value(
+            name,
+            "numbers by name",
+            lambda v: isinstance(v, dict) and all(map(_is_finite, v.values())),
+        )
+
+    def entries(self, name: str) -> list[Stored]:
+        """The objects of a list, over the same parts."""
+        values = self._value(
+            name,
+            "a list of objects",
+            lambda v: isinstance(v, list) and all(isinstance(entry, dict) for entry in v),
+        )
+        return [replace(self, metadata=value) for value in values]
+
+    def _value(self, name: str, wanted: str, valid: Callable[[Any], bool]) -> Any:
+        value = self.metadata.get(name)
+        if not valid(value):
+            raise self.refusal(f'its "{name}" must be {wanted}, not {repr(value)[:40]}')
+        return value
+
+
+def _fault(content: bytes) -> str:
+    """What keeps the content of a file from being what ``write`` has written, to the bit."""
+    if not content.startswith(_MAGIC):
+        return "damaged or no OpenEXR file"
+    ours = _ATTRIBUTE_BYTES.search(content, 0, _HEADER)
+    if not ours:
+        return "damaged or not a file of envmap_integrator"
+    if int(ours[1]) != FORMAT:
+        return f"written in format {int(ours[1])}, this version reads format {FORMAT}"
+    if _digest(content[:-_DIGEST_SIZE]) != content[-_DIGEST_SIZE:]:
+        return "truncated or damaged"
+    return ""
+
+
+def _digest(content: bytes) -> bytes:
+    return hashlib.blake2b(content, digest_size=_DIGEST_SIZE).digest()
+
+
+def _parse(content: bytes) -> tuple[Parts, dict[str, Any]]:
+    with OpenEXR.File(io.BytesIO(content), separate_channels=True, header_only=True) as file:
+        size = _claimed_size([part.header for part in file.parts])
+        if size > _COMPRESSION * len(content):
+            raise ValueError("sizes that can't be true")
+        _ask_for_memory(size)
+        metadata = json.loads(file.parts[0].header[ATTRIBUTE])
+    with OpenEXR.File(io.BytesIO(content), separate_channels=True) as file:
+        parts = {
+            part.name(): {name: channel.pixels for name, channel in part.channels.items()}
+            for part in file.parts
+        }
+    return parts, dict(metadata)
+
+
+def _ask_for_memory(size: int) -> None:
+    if size > free_memory():
+        raise MemoryError
+
+
+def _claimed_size(headers: list[dict[str, Any]]) -> int:
+    """Bytes of the pixels that headers announce."""
+    total = 0
+    for header in headers:
+        low, high = (np.asarray(corner, dtype=object) for corner in header["dataWindow"])
+        total += 4 * len(header["channels"]) * int(np.prod(high - low + 1))
+    return total
+
+
+def _is_finite(value: Any) -> bool:
+    """Whether it's a number that Mitsuba can hold."""
+    return type(value) in (int, float) and abs(value) <= float(np.finfo(np.float32).max)
 
 
 def _display_window(parts: Parts) -> tuple[np.ndarray, np.ndarray]:
     """OpenEXR wants one for all parts: the one that holds them all."""
     shapes = [image.shape for channels in parts.values() for image in channels.values()]
     return np.zeros(2, np.int32), np.max(shapes, axis=0)[::-1].astype(np.int32) - 1
-
-
-def _checksum(parts: Parts) -> str:
-    digest = hashlib.blake2b(digest_size=16)
-    for name in sorted(parts):
-        for channel in sorted(parts[name]):
-            digest.update(f"{name}/{channel}".encode())
-            digest.update(np.ascontiguousarray(parts[name][channel]).tobytes())
-    return digest.hexdigest()

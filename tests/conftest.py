@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import re
+import tempfile
 from pathlib import Path
 
 import envmap_integrator  # noqa: F401  (before mitsuba: it chooses libLLVM)
@@ -71,6 +72,18 @@ def clean_drjit():
     gc.collect()
     dr.sync_thread()
     dr.flush_malloc_cache()
+
+
+# ---------------------- Files ----------------------
+
+
+@pytest.fixture
+def public_folder():
+    """A folder like ``tmp_path``, but others can come to it."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        folder.chmod(0o755)
+        yield folder
 
 
 # ---------------------- Pictures ----------------------

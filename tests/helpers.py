@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import resource
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -102,6 +106,31 @@ def emitting(*radiance: float) -> Description:
 
 def colour(*value: float) -> Description:
     return {"type": "rgb", "value": list(value) if len(value) > 1 else value[0]}
+
+
+@contextmanager
+def unprivileged() -> Iterator[None]:
+    """Without the right of the superuser to ignore permissions, if that is who runs the tests."""
+    nobody = 65534
+    if os.getuid() != 0:
+        yield
+        return
+    os.setresuid(nobody, nobody, 0)
+    try:
+        yield
+    finally:
+        os.setresuid(0, 0, 0)
+
+
+@contextmanager
+def at_most(size: int) -> Iterator[None]:
+    """No file may grow larger than ``size`` bytes, as on a disk that is full."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (int(size), limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 def at(x: float, y: float, z: float) -> mi.ScalarTransform4f:

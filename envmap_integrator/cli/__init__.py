@@ -6,6 +6,7 @@ The stock ``mitsuba`` executable can't load plugins written in Python; this one 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,23 +16,36 @@ from envmap_integrator.cli import commands
 from envmap_integrator.cli.doctor import doctor
 from envmap_integrator.cli.errors import condense
 from envmap_integrator.cli.scene_file import parse_assignment, parse_setting
+from envmap_integrator.interrupt import interruptible
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
+_INTERRUPTED = "envmap-render: interrupted"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; return the exit code: 0, 1 (``doctor`` found a fault) or 2 (bad input)."""
+    """Run one command; return the exit code.
+
+    That is 0, 1 (``doctor`` found a fault), 2 (bad input) or 130 (Ctrl-C).
+    """
     args = build_parser().parse_args(arguments)
     try:
-        return args.command(args)
+        with interruptible(otherwise=_end):
+            return args.command(args)
     except KeyboardInterrupt:
+        print(_INTERRUPTED, file=sys.stderr)
         return EXIT_INTERRUPTED
-    except (ValueError, TypeError, RuntimeError, ImportError, OSError) as error:
+    except (ValueError, TypeError, RuntimeError, ImportError, OSError, MemoryError) as error:
         if args.debug:
             raise
         print(f"envmap-render: {condense(error)}", file=sys.stderr)
         return EXIT_BAD_INPUT
+
+
+def _end() -> None:
+    """End the process amid a kernel; files are either complete or not there."""
+    os.write(sys.stderr.fileno(), f"{_INTERRUPTED}\n".encode())
+    os._exit(EXIT_INTERRUPTED)
 
 
 class _Parser(argparse.ArgumentParser):

@@ -13,7 +13,8 @@ from rich.console import Console
 from rich.table import Table
 
 import envmap_integrator
-from envmap_integrator.cli.output import replacing, write_png
+from envmap_integrator.atomic import check_writable
+from envmap_integrator.cli.output import write_bitmap, write_png
 from envmap_integrator.cli.scene_file import SceneFile
 from envmap_integrator.cli.timing import compilation_time, measure, record_kernels
 from envmap_integrator.denoiser import denoise, warm_up
@@ -36,7 +37,8 @@ def render(args: argparse.Namespace) -> int:
         if hasattr(scene.integrator(), "prepare"):
             seconds |= scene.integrator().prepare(scene).stage_times
         with measure(seconds, "render"):
-            dr.eval(mi.render(scene, sensor=sensor, seed=args.seed, spp=args.spp))
+            # Not mi.render, which would make another exception of Ctrl-C.
+            dr.eval(scene.integrator().render(scene, sensor, seed=args.seed, spp=args.spp))
         bitmap = sensor.film().bitmap()
         if args.denoise:
             with measure(seconds, "denoise"):
@@ -48,8 +50,7 @@ def render(args: argparse.Namespace) -> int:
     metadata["settings"] = json.dumps(settings)
     metadata["stage_times"] = json.dumps(seconds)
     metadata["compilation_time"] = compilation
-    with replacing(output) as temporary:
-        bitmap.write(str(temporary))
+    write_bitmap(output, bitmap)
     if args.png:
         write_png(output.with_suffix(".png"), bitmap)
     _report(seconds, compilation, output)
@@ -61,7 +62,8 @@ def _denoise(bitmap: mi.Bitmap, scene: mi.Scene, settings: dict[str, object]) ->
     pixels = np.array(bitmap, copy=False)
     _require(
         pixels.ndim == 3 and pixels.shape[2] >= 3,
-        '--denoise needs colour: set the film\'s "pixel_format" to rgb or rgba',
+        f"--denoise needs colour, the film has {pixels[0, 0].size} channel(s): set its "
+        '"pixel_format" to rgb or rgba',
     )
     spp, seed, sensor = (settings[key] for key in ("spp", "seed", "sensor"))
     pixels[:, :, :3] = denoise(scene, pixels[:, :, :3], spp, seed, sensor)
@@ -82,8 +84,7 @@ def bake(args: argparse.Namespace) -> int:
         state = scene.integrator().prepare(scene)
         seconds |= state.stage_times
         compilation = compilation_time()
-    with replacing(args.output) as temporary:
-        state.save(temporary)
+    state.save(args.output)
     _report(seconds, compilation, args.output)
     return 0
 
@@ -119,7 +120,8 @@ def _sensor(scene: mi.Scene, index: int) -> mi.Sensor:
     sensors = scene.sensors()
     _require(
         0 <= index < len(sensors),
-        f"-s/--sensor {index} is out of range: the scene has {len(sensors)} sensor(s)",
+        f"-s/--sensor {index} is out of range: the scene has {len(sensors)} sensor(s), the first "
+        "is 0",
     )
     return sensors[index]
 
@@ -144,7 +146,7 @@ def _settings(
 def _check_output(path: Path) -> None:
     """Fail before the work starts rather than after it."""
     _require(path.suffix == ".exr", f'output "{path}" must end in .exr (--png adds a PNG)')
-    _require(path.parent.is_dir(), f'output folder "{path.parent}" does not exist: create it')
+    check_writable(path)
 
 
 def _require(condition: bool, message: str) -> None:

@@ -2,31 +2,30 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import mitsuba as mi
 
+from envmap_integrator.atomic import replacing
 
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary path in the same folder; on success it takes the place of ``path``.
 
-    So ``path`` is at no time half written, and an error leaves its old content alone.
+def write_bitmap(path: Path, bitmap: mi.Bitmap) -> None:
+    """Write a picture in the format that the name asks for; raise ``StorageError`` if that fails.
+
+    Through memory: Mitsuba doesn't notice if the last bytes find no room on a disk.
     """
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    stream = mi.MemoryStream()
+    bitmap.write(stream, getattr(mi.Bitmap.FileFormat, _FORMATS[path.suffix]))
+    with replacing(path) as file:
+        file.write(stream.raw_buffer())
 
 
 def write_png(path: Path, bitmap: mi.Bitmap) -> None:
     """Write the radiance channels of ``bitmap`` in sRGB, 8 bits a channel."""
     _, radiance = bitmap.split()[0]
     picture = radiance.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
-    with replacing(path) as temporary:
-        picture.write(str(temporary))
+    write_bitmap(path, picture)
+
+
+#: Formats by the ends of names.
+_FORMATS = {".exr": "OpenEXR", ".png": "PNG"}

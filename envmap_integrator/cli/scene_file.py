@@ -25,13 +25,16 @@ class SceneFile:
 
     def __init__(self, path: Path, parameters: Mapping[str, str] | None = None):
         if not path.is_file():
-            raise FileNotFoundError(f'scene "{path}" does not exist')
+            raise FileNotFoundError(f'there is no scene file "{path}"; check the path')
         self._folder = path.parent
         self._config = mi.parser.ParserConfig(mi.variant())
         with _search_folder(self._folder):
             self._state = mi.parser.parse_file(self._config, str(path), **(parameters or {}))
         if self._state.root.type != mi.ObjectType.Scene:
-            raise ValueError(f'the root element of "{path}" must be a <scene>')
+            root = self._state.root.props.plugin_name()
+            raise ValueError(
+                f'the root element of "{path}" must be a <scene>, not of type "{root}"'
+            )
         if not self._children(self._state.root, mi.ObjectType.Integrator):
             self._append_child(self._state.root, mi.ObjectType.Integrator, DEFAULT_INTEGRATOR)
 

@@ -9,7 +9,7 @@ from ..checks import check_variant
 from ..jit import upload
 from ..maps.clusters import ClusterRequest
 from ..maps.cube import direction_to_face, face_to_direction, solid_angles, texel
-from ..maps.cube_map import from_parts
+from ..maps.cube_map import from_stored
 from ..parameters import Parameters
 from ..storage import StorageError, read
 
@@ -56,7 +56,8 @@ class MipmapCube(mi.Emitter):
         filename = parameters.text("filename")
         if bool(shapes) == bool(filename):
             raise ValueError(
-                f'{parameters.owner}: give either "filename" (a baked map) or "shapes" (a cluster)'
+                f'{parameters.owner}: give either "filename" (a baked map) or "shapes" (a '
+                f"cluster), not {'both' if shapes else 'neither'}"
             )
         if shapes:
             names = tuple(name.strip() for name in shapes.split(",") if name.strip())
@@ -175,14 +176,20 @@ class MipmapCube(mi.Emitter):
 def _load(owner, filename, name):
     path = mi.file_resolver().resolve(filename)
     try:
-        parts, metadata = read(path, "make it with envmap-render bake")
-        maps = metadata["maps"]
-        known = [entry["name"] for entry in maps]
+        stored = read(path, "make it with envmap-render bake")
+        maps = stored.entries("maps")
+        known = [entry.text("name") for entry in maps]
         if name and name not in known:
-            raise StorageError(f'{path}: holds no map "{name}", only {", ".join(known) or "none"}')
+            raise StorageError(
+                f'{path}: holds no map "{name}", only {", ".join(known) or "none"}; name one of '
+                "these"
+            )
         if not maps:
-            raise StorageError(f"{path}: holds no maps; its scene has no clusters")
+            raise StorageError(
+                f'{path}: holds no maps, its scene has no clusters; set "maps" to "always" or list '
+                "a cluster, and make it again with envmap-render bake"
+            )
         index = known.index(name) if name else 0
-        return from_parts(parts, maps[index], prefix=f"map{index}/")
+        return from_stored(maps[index], prefix=f"map{index}/")
     except StorageError as error:
         raise ValueError(f"{owner}: {error}") from None

@@ -7,11 +7,12 @@ import mitsuba as mi
 
 from ..checks import check_scene, check_variant
 from ..fingerprint import SceneFingerprint
+from ..interrupt import interruptible
 from ..parameters import Parameters
 from ..pipeline import Prepared, Settings, load, prepare
 from ..radiosity.surface_points import ObjectIds
 from ..rendering.camera import CameraSample, camera_radiance
-from ..rendering.film import expose, expose_filtered
+from ..rendering.film import expose, expose_filtered, most_samples
 from ..rendering.source_choice import Emitters, SourceChoice
 from ..rendering.transport import Residual, Transport
 
@@ -98,10 +99,12 @@ class CachedIntegrator(mi.SamplingIntegrator):
         if self._prepared is None or self._prepared.key != key:
             check_scene(scene, self.owner)
             if self.cache_file:
-                self._prepared = load(self.cache_file, key, self.owner)
+                self._prepared = load(self.cache_file, key, self.owner, len(scene.emitters()))
             else:
-                with dr.suspend_grad():
-                    self._prepared = prepare(scene, key, self.settings(), self.bake_with())
+                with interruptible(), dr.suspend_grad():
+                    self._prepared = prepare(
+                        scene, key, self.settings(), self.owner, self.bake_with()
+                    )
         return self._prepared
 
     def transport_from(self, scene: mi.Scene, prepared: Prepared, **more) -> Transport:
@@ -138,7 +141,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
         prepared = self.prepare(scene)
         self._seed = seed
         film = sensor.film()
-        with dr.suspend_grad():
+        with interruptible(), dr.suspend_grad():
             sampler, spp = self._pixel_sampler(sensor, spp)
             transport = self.transport(scene, prepared, spp)
 
@@ -170,7 +173,14 @@ class CachedIntegrator(mi.SamplingIntegrator):
         own = self.sampler == "scene"
         sampler = sensor.sampler().clone() if own else mi.load_dict({"type": self.sampler})
         sampler.set_sample_count(spp)
-        return sampler, sampler.sample_count()
+        spp = sampler.sample_count()
+        most = most_samples(sensor)
+        if spp > most:
+            raise ValueError(
+                f'{self.owner}: "sampler" {self.sampler} takes at most {most} samples per pixel of '
+                f"such a film, not {spp}; leave it out to take any number"
+            )
+        return sampler, spp
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
         found = self.radiance(scene, self.prepare(scene), sampler, ray, active)

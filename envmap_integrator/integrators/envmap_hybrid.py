@@ -5,6 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 
 from ..emitters.mipmap_cube import MipmapCube
+from ..maps.cube_map import MAX_RESOLUTION
 from ..maps.far_field import FarField, far_field
 from ..parameters import Parameters
 from .common import CachedIntegrator
@@ -122,7 +123,7 @@ class EnvmapHybrid(CachedIntegrator):
         self.lookup = parameters.choice("lookup", "corrected", ("corrected", "plain"))
         self.mirrors = parameters.choice("mirrors", "trace", ("trace", "map"))
         self.maps = parameters.choice("maps", "auto", ("auto", "always"))
-        self.map_resolution = parameters.power_of_two("map_resolution", 64, 1, 2048)
+        self.map_resolution = parameters.power_of_two("map_resolution", 64, 1, MAX_RESOLUTION)
         self.distance_ratio = parameters.number("distance_ratio", 2.0, 1.0)
         self.mip_bias = parameters.number("mip_bias", -2.0, -32.0, 32.0)
 

@@ -89,7 +89,8 @@ def listed_clusters(
         member = members[points.object_id]
         if not member.any():
             raise ValueError(
-                f"{owner}: no surface was found on {_some(request.shape_ids)}; is it empty?"
+                f"{owner}: no surface was found on {_some(request.shape_ids)}; list shapes that "
+                "aren't empty"
             )
         if (space[member] >= 0).any():
             member &= space == np.bincount(space[member & (space >= 0)]).argmax()

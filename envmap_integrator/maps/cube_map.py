@@ -6,10 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..storage import Parts, StorageError
+from ..storage import Parts, Stored
 from .clusters import Cluster
 from .cube import n_levels
 
+#: Texels along the edge of a face at most.
+MAX_RESOLUTION = 2048
 #: Names of the radiance channels, by their number.
 RADIANCE_CHANNELS = {1: ("Y",), 3: ("R", "G", "B")}
 
@@ -32,6 +34,11 @@ class CubeMap:
         return self.levels[0].shape[1]
 
     @property
+    def n_channels(self) -> int:
+        """Of colour."""
+        return self.levels[0].shape[-1] - 1
+
+    @property
     def masked(self) -> float:
         """Share of finest texels that hold nothing of their own."""
         return float((self.levels[0][..., -1] < 0).mean())
@@ -43,8 +50,7 @@ class CubeMap:
 
 def to_parts(cube_map: CubeMap, prefix: str = "") -> tuple[Parts, dict]:
     """EXR parts, one a level with the six faces side by side, and metadata of a map."""
-    n_channels = cube_map.levels[0].shape[-1] - 1
-    names = (*RADIANCE_CHANNELS[n_channels], "inverse_distance")
+    names = (*RADIANCE_CHANNELS[cube_map.n_channels], "inverse_distance")
     parts = {}
     for number, level in enumerate(cube_map.levels):
         image = np.concatenate(list(level), axis=1)
@@ -62,21 +68,28 @@ def to_parts(cube_map: CubeMap, prefix: str = "") -> tuple[Parts, dict]:
     return parts, metadata
 
 
-def from_parts(parts: Parts, metadata: dict, prefix: str = "") -> CubeMap:
-    """The map that ``to_parts`` has taken apart."""
-    try:
-        levels = []
-        for number in range(n_levels(metadata["resolution"])):
-            channels = parts[f"{prefix}level{number}"]
-            names = next(n for n in RADIANCE_CHANNELS.values() if n[0] in channels)
-            image = np.stack([channels[name] for name in (*names, "inverse_distance")], axis=-1)
-            levels.append(np.stack(np.split(image, 6, axis=1)))
-        cluster = Cluster(
-            metadata["name"],
-            np.array(metadata["centre"]),
-            metadata["radius"],
-            metadata["half_width"],
-        )
-    except (KeyError, StopIteration) as error:
-        raise StorageError(f"a part of the map is missing: {error}") from None
+def from_stored(stored: Stored, prefix: str = "") -> CubeMap:
+    """The map that ``to_parts`` has taken apart, from its metadata and the parts of a file.
+
+    Raises ``StorageError`` if that isn't a map.
+    """
+    resolution = stored.integer("resolution", 1, MAX_RESOLUTION)
+    if resolution & (resolution - 1):
+        raise stored.refusal(f'its "resolution" must be a power of two, not {resolution}')
+    finest = stored.parts.get(f"{prefix}level0", {})
+    names = next((n for n in RADIANCE_CHANNELS.values() if n[0] in finest), RADIANCE_CHANNELS[1])
+    levels = []
+    for number in range(n_levels(resolution)):
+        size = resolution >> number
+        channels = [
+            stored.array(f"{prefix}level{number}", name, np.float32)
+            for name in (*names, "inverse_distance")
+        ]
+        if any(channel.shape != (size, 6 * size) for channel in channels):
+            raise stored.refusal(f'its "{prefix}level{number}" has another size than 6 * {size}²')
+        levels.append(np.stack(np.split(np.stack(channels, axis=-1), 6, axis=1)))
+    centre = np.array(stored.point("centre"))
+    cluster = Cluster(
+        stored.text("name"), centre, stored.number("radius"), stored.number("half_width")
+    )
     return CubeMap(cluster, levels)

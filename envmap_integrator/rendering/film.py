@@ -7,6 +7,7 @@ from operator import add
 import drjit as dr
 import mitsuba as mi
 
+from ..interrupt import going_on
 from ..progress import stage
 from .irradiance_filter import Gathered, filter_irradiance, pixel_records, tolerance
 from .pixel_filter import PixelFilter
@@ -15,6 +16,11 @@ from .sample_points import SamplePoints
 #: Lanes of a render at least, where it has as many samples (fewer would leave threads idle), and at
 #: most, which is Dr.Jit's limit.
 MIN_LANES, MAX_LANES = 1 << 20, (1 << 32) - 1
+
+
+def most_samples(sensor: mi.Sensor) -> int:
+    """Samples per pixel at most with Mitsuba's samplers, which need a lane for each."""
+    return MAX_LANES // _pixels(sensor.film())
 
 
 def expose(sensor, sampler, spp, seed, shade, names: list[str], aovs) -> None:
@@ -71,8 +77,7 @@ def _accumulate(sensor, sampler, spp, seed, shade, channels, n_further) -> list[
     """Sums over the samples of each pixel, row by row, of ``channels(found, weight)``."""
     film = sensor.film()
     pixel_filter = PixelFilter(film.rfilter())
-    size = mi.ScalarVector2u(film.crop_size())
-    n_pixels, width = int(size[0]) * int(size[1]), dr.opaque(mi.UInt32, int(size[0]))
+    n_pixels, width = _pixels(film), dr.opaque(mi.UInt32, int(film.crop_size()[0]))
     corner = mi.Vector2i(film.crop_offset())
 
     def values(sampler, pixel, index):
@@ -80,11 +85,11 @@ def _accumulate(sensor, sampler, spp, seed, shade, channels, n_further) -> list[
         return channels(*_sample(sensor, pixel_filter, sampler, shade, position, index))
 
     with stage("Rendering"):
+        n_channels = len(_shown(film, mi.Spectrum(0), mi.Bool(True), mi.Float(1))) + n_further
         if sampler is None:
-            n_channels = len(_shown(film, mi.Spectrum(0), mi.Bool(True), mi.Float(1))) + n_further
             sums = _lane_per_pixel(values, n_pixels, spp, seed, n_channels)
         else:
-            sums = _lane_per_sample(values, n_pixels, spp, seed, sampler)
+            sums = _lane_per_sample(values, n_pixels, spp, seed, n_channels, sampler)
         dr.eval(sums)
         dr.sync_thread()
     return sums
@@ -95,48 +100,49 @@ def _lane_per_pixel(values, n_pixels, spp, seed, n_channels):
 
     Nothing is stored for a sample, and neighbouring lanes are neighbouring pixels.
     """
-    wanted = min(-(-MIN_LANES // n_pixels), spp)
-    parts = next(n for n in range(wanted, 0, -1) if spp % n == 0)
+    parts = min(-(-MIN_LANES // n_pixels), spp)
     lane, n_pixels_ = dr.arange(mi.UInt32, n_pixels * parts), dr.opaque(mi.UInt32, n_pixels)
-    pixel, per_lane = lane % n_pixels_, dr.opaque(mi.UInt32, spp // parts)
-    first = lane // n_pixels_ * per_lane
-    points = SamplePoints.of(seed, pixel, spp, first)
+    pixel, part = lane % n_pixels_, lane // n_pixels_
+    least, longer = (dr.opaque(mi.UInt32, n) for n in divmod(spp, parts))
+    first = part * least + dr.minimum(part, longer)
+    end = first + least + dr.select(part < longer, mi.UInt32(1), 0)
     sums = [dr.zeros(mi.Float, n_pixels * parts) for _ in range(n_channels)]
-    sums = _sums(values, points, pixel, first, per_lane, sums)
+    sums = _sums(values, SamplePoints.of(seed, pixel, spp, first), pixel, end, sums)
     if parts == 1:
         return sums
     dr.eval(sums)
     parts_ = dr.opaque(mi.UInt32, parts)
     lanes_of_pixel = lane % parts_ * n_pixels_ + lane // parts_
-    return [dr.block_sum(dr.gather(mi.Float, part, lanes_of_pixel), parts) for part in sums]
+    return [dr.block_sum(dr.gather(mi.Float, s, lanes_of_pixel), parts) for s in sums]
 
 
 @dr.syntax
-def _sums(values, points, pixel, first, count, sums):
-    i = mi.UInt32(0)
-    while dr.hint(i < count, label="Samples of a pixel"):
-        sums = [*map(add, sums, values(points, pixel, first + i))]
+def _sums(values, points, pixel, end, sums):
+    going = points.index < end
+    while dr.hint(going, label="Samples of a pixel"):
+        sums = [*map(add, sums, values(points, pixel, points.index))]
         points.advance()
-        i += 1
+        going &= (points.index < end) & going_on(points.index)
     return sums
 
 
-def _lane_per_sample(values, n_pixels, spp, seed, sampler):
+def _lane_per_sample(values, n_pixels, spp, seed, n_channels, sampler):
     """Mitsuba's samplers want the samples of a pixel side by side."""
-    n_lanes = n_pixels * spp
-    if n_lanes > MAX_LANES:
-        raise ValueError(
-            f"the sampler {sampler.class_name()} allows {MAX_LANES // n_pixels} samples per pixel "
-            f'of this film, not {spp}; leave "sampler" out to take as many as you like'
-        )
     sampler.set_samples_per_wavefront(spp)
-    sampler.seed(seed, n_lanes)
-    index, spp_ = dr.arange(mi.UInt32, n_lanes), dr.opaque(mi.UInt32, spp)
-    pixel = index // spp_
-    sums = []
-    for value in values(sampler, pixel, index % spp_):
-        sums.append(dr.zeros(mi.Float, n_pixels))
-        dr.scatter_add(sums[-1], value, pixel)
+    sampler.seed(seed, n_pixels * spp)
+    index, spp_ = dr.arange(mi.UInt32, n_pixels * spp), dr.opaque(mi.UInt32, spp)
+    sums = [dr.zeros(mi.Float, n_pixels) for _ in range(n_channels)]
+
+    def trace(sampler, index):
+        pixel = index // spp_
+        for total, value in zip(sums, values(sampler, pixel, index % spp_), strict=True):
+            dr.scatter_add(total, value, pixel)
+        return sampler, index
+
+    def leave(sampler, index):
+        return sampler, index
+
+    dr.if_stmt((sampler, index), going_on(index), trace, leave, mode="symbolic")
     return sums
 
 
@@ -153,6 +159,10 @@ def _sample(sensor, pixel_filter, sampler, shade, position, index):
     ray, weight = sensor.sample_ray_differential(time, 0, within, aperture)
     found = shade(sampler, mi.Ray3f(ray), index)
     return found.scaled(weight * filter_weight), filter_weight
+
+
+def _pixels(film: mi.Film) -> int:
+    return int(film.crop_size()[0]) * int(film.crop_size()[1])
 
 
 def _shown(film: mi.Film, radiance, valid, weight) -> list[mi.Float]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from envmap_integrator.cli import main
-from tests.helpers import ball, camera, cluster, grey, integrator, load, room
+from tests.helpers import PATCHES, ball, camera, cluster, integrator, load, room
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -161,14 +161,19 @@ def test_damaged_files(saved, tmp_path, damage, message, reader):
     assert str(path) in error and message in error and "envmap-render bake" in error
 
 
-@pytest.mark.parametrize("change", ["scene", "settings"])
-def test_file_of_another_scene_or_other_settings(saved, change):
-    scene = room(ball=None, block=None, cup=ball(0, 0, 0, 1) | grey(0.5))
-    settings = {"desk": cluster()}
-    if change == "settings":
-        scene, settings["patches"] = room(), 999
-    error = complaint(prepare, scene, cache_file=str(saved), **settings)
-    assert "made for another scene or other settings" in error
+@pytest.mark.parametrize(
+    ("scene", "settings", "message"),
+    [
+        (lambda: room(ball=None, block=None, cup=ball(0, 0, 0, 1)), {}, "another scene or variant"),
+        (room, {"patches": 999}, f"made with patches={PATCHES}, not patches=999"),
+        (room, {"map_resolution": 8}, "made with map_resolution=64, not map_resolution=8"),
+    ],
+    ids=["scene", "patches", "map_resolution"],
+)
+def test_file_of_another_scene_or_other_settings(saved, scene, settings, message):
+    error = complaint(prepare, scene(), desk=cluster(), cache_file=str(saved), **settings)
+    assert f"{saved}: " in error and message in error
+    assert error.endswith("; make it again with envmap-render bake")
     assert "\n" not in error
 
 

@@ -10,10 +10,12 @@ import numpy as np
 import OpenEXR
 import pytest
 
+from envmap_integrator.atomic import StorageError
 from envmap_integrator.cli import main
-from envmap_integrator.cli.output import replacing
+from envmap_integrator.cli.output import write_bitmap
 from envmap_integrator.cli.scene_file import SceneFile
 from envmap_integrator.denoiser import denoise
+from tests.helpers import at_most, unprivileged
 
 SCENE = """
 <scene version="3.0.0">
@@ -203,16 +205,6 @@ def test_bake_saves_the_state(scene, preparing_integrator, tmp_path):
     assert output.read_text() == "baked"
 
 
-def test_a_failed_write_leaves_the_old_file(tmp_path):
-    path = tmp_path / "picture.exr"
-    path.write_text("old")
-    with pytest.raises(OSError), replacing(path) as temporary:
-        temporary.write_text("half")
-        raise OSError
-    assert path.read_text() == "old"
-    assert list(tmp_path.iterdir()) == [path]
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -226,7 +218,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
         (("-t", "0"), "-t/--threads must be at least 1"),
         (("--spp", "-1"), "--spp must not be negative"),
         (("-o", "picture.png"), "must end in .exr"),
-        (("-o", "nowhere/picture.exr"), "does not exist"),
+        (("-o", "nowhere/picture.exr"), "there is no folder nowhere; make it first"),
     ],
 )
 def test_bad_input_gives_one_line_and_exit_code_2(scene, capsys, options, message):
@@ -239,6 +231,35 @@ def test_bad_input_gives_one_line_and_exit_code_2(scene, capsys, options, messag
     assert message in error
     assert error.count("\n") == 1
     assert not scene.with_suffix(".exr").exists()
+
+
+def test_a_folder_that_is_not_writable(public_folder, capsys):
+    """Noticed before the work starts."""
+    scene = write_scene(public_folder, PATH)
+    public_folder.chmod(0o555)
+    with unprivileged():
+        assert run("render", scene) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"envmap-render: {scene.with_suffix('.exr')}: the folder ")
+    assert "isn't writable; change its permissions" in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".png"])
+def test_a_disk_that_is_full(tmp_path, suffix):
+    """Wherever in the picture the room ends."""
+    mi.set_variant("llvm_ad_rgb")
+    path = tmp_path / f"picture{suffix}"
+    pixels = np.random.default_rng(1).integers(0, 255, (64, 64, 3), dtype=np.uint8)
+    bitmap = mi.Bitmap(pixels)
+    if suffix == ".exr":
+        bitmap = bitmap.convert(component_format=mi.Struct.Type.Float32)
+    write_bitmap(path, bitmap)
+    before = path.read_bytes()
+    for limit in (0, 100, len(before) // 2, len(before) - 1):
+        with at_most(limit), pytest.raises(StorageError, match=f"^{path}: can't be written: File"):
+            write_bitmap(path, bitmap)
+        assert path.read_bytes() == before
+        assert list(tmp_path.iterdir()) == [path]
 
 
 def test_missing_scene(tmp_path, capsys):

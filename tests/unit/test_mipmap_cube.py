@@ -15,7 +15,7 @@ from envmap_integrator.maps.cube import (
     n_levels,
     solid_angles,
 )
-from envmap_integrator.maps.cube_map import CubeMap, from_parts, to_parts
+from envmap_integrator.maps.cube_map import CubeMap, from_stored, to_parts
 from envmap_integrator.maps.mipmap import build_levels
 from envmap_integrator.storage import read, write
 from tests.helpers import assert_agree, camera, exactly, grey, load, measure
@@ -84,9 +84,9 @@ def seen(emitter, d: mi.Vector3f) -> np.ndarray:
 @pytest.mark.parametrize("channels", [1, 3])
 def test_a_reloaded_map_is_identical(tmp_path, channels):
     ours = [map_of(random_radiance(channels), name) for name in ("a", "b")]
-    parts, metadata = read(save(tmp_path / "map.exr", *ours), "")
+    maps = read(save(tmp_path / "map.exr", *ours), "").entries("maps")
     for index, original in enumerate(ours):
-        reloaded = from_parts(parts, metadata["maps"][index], prefix=f"map{index}/")
+        reloaded = from_stored(maps[index], prefix=f"map{index}/")
         assert np.array_equal(reloaded.texels(), original.texels())
         assert reloaded.masked == original.masked
         assert reloaded.cluster.name == original.cluster.name
@@ -303,7 +303,7 @@ def test_the_background_shows_the_map(tmp_path):
         ({"filename": "map.exr", "shapes": "ball"}, 'give either "filename" .* or "shapes"'),
         ({"filename": "none.exr"}, "none.exr: no such file; make it with envmap-render bake"),
         ({"filename": "notes.exr"}, "notes.exr: damaged or no OpenEXR file"),
-        ({"filename": "empty.exr"}, "empty.exr: holds no maps; its scene has no clusters"),
+        ({"filename": "empty.exr"}, 'empty.exr: holds no maps, .*; set "maps" to'),
         ({"filename": "map.exr", "map": "sofa"}, 'holds no map "sofa", only cluster'),
         ({"filename": "map.exr", "level": -1.0}, '"level" must be at least 0, not -1.0'),
         ({"filename": "map.exr", "level": "fine"}, "\"level\" must be a number, not 'fine'"),
@@ -339,7 +339,7 @@ def test_a_cluster_keeps_its_shapes():
 
 def test_sizes_of_the_file(tmp_path):
     """One part a level, the six faces side by side: what a viewer shows."""
-    parts, _ = read(save(tmp_path / "map.exr", map_of(random_radiance())), "")
+    parts = read(save(tmp_path / "map.exr", map_of(random_radiance())), "").parts
     shapes = [parts[f"map0/level{level}"]["R"].shape for level in range(n_levels(RESOLUTION))]
     assert shapes == [(size, 6 * size) for size in (8, 4, 2, 1)]
     assert solid_angles(RESOLUTION).shape == shapes[0][:1] * 2

@@ -1,0 +1,467 @@
+"""Every error of the package says in one line what is wrong, with which value, and how to mend it.
+
+Each place in the package that raises an error has a case here; the source is searched for them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import envmap_integrator
+from envmap_integrator import memory, storage
+from envmap_integrator.atomic import check_writable, replacing
+from envmap_integrator.checks import check_scene, check_variant
+from envmap_integrator.cli import commands
+from envmap_integrator.cli.scene_file import SceneFile, parse_assignment
+from envmap_integrator.denoiser import warm_up
+from envmap_integrator.llvm import ensure_llvm
+from envmap_integrator.maps.clusters import ClusterRequest, listed_clusters
+from envmap_integrator.parameters import Parameters
+from envmap_integrator.rendering import film
+from tests.helpers import ball, camera, cluster, integrator, load, room, unprivileged
+from tests.unit.kit import surface_points
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+PACKAGE = Path(envmap_integrator.__file__).parent
+#: What isn't a message for users: an abstract method, errors raised on, and those that are caught.
+EXCEPTED = {
+    "raise NotImplementedError",
+    "raise",
+    """raise ValueError("sizes that can't be true")""",
+    "raise MemoryError",
+    "raise error",
+    "raise KeyboardInterrupt from error",
+}
+MEDIUM = {"type": "homogeneous", "albedo": 0.5, "sigma_t": 1.0}
+#: Of small pieces, so that a change of a file's content is quick.
+SETTINGS = {"patches": 64, "map_resolution": 4, "desk": cluster()}
+
+Site = tuple[str, int]
+
+
+@dataclass(frozen=True)
+class Case:
+    """An action that ends in an error, and what its message has to name."""
+
+    action: Callable[[Surroundings], object]
+    object: str
+    value: str
+    mend: str
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What actions need: a folder, one that others can come to, a saved state, and patches."""
+
+    folder: Path
+    public: Path
+    state: Path
+    patch: pytest.MonkeyPatch
+
+
+# ---------------------- The cases ----------------------
+
+
+def parameter(method: str, value: object, *arguments: object) -> Callable:
+    def action(_):
+        props = mi.Properties("plugin")
+        props.set_id("ours")
+        props["x"] = value
+        getattr(Parameters(props), method)("x", *arguments)
+
+    return action
+
+
+def scene(**changes: object) -> Callable:
+    return lambda _: check_scene(load(room(**changes)), "ours")
+
+
+def emitter(**parameters: object) -> Callable:
+    return lambda s: mi.load_dict(
+        {"type": "mipmap_cube", "id": "sky"}
+        | {key: str(v(s)) if key == "filename" else v for key, v in parameters.items()}
+    )
+
+
+def listed(*shapes: str) -> Callable:
+    request = ClusterRequest("desk", shapes, None)
+    points = surface_points(np.zeros((1, 3)), [0, 0, 1], object_id=0)
+    return lambda _: listed_clusters(points, np.zeros(1), load(room()), (request,), 2.0)
+
+
+def use(make: Callable[[Surroundings], Path]) -> Callable:
+    """Prepare from the file that ``make`` leaves."""
+    return lambda s: integrator("envmap_hybrid", cache_file=str(make(s)), **SETTINGS).prepare(
+        load(room())
+    )
+
+
+def altered(change: Callable[[dict, dict], object]) -> Callable[[Surroundings], Path]:
+    """A state of which ``change(parts, metadata)`` has altered something."""
+
+    def make(s):
+        stored = storage.read(s.state, "")
+        change(stored.parts, stored.metadata)
+        storage.write(s.folder / "altered.exr", stored.parts, stored.metadata)
+        return s.folder / "altered.exr"
+
+    return make
+
+
+def with_bytes(change: Callable[[bytes], bytes]) -> Callable[[Surroundings], Path]:
+    def make(s):
+        path = s.folder / "altered.exr"
+        path.write_bytes(change(s.state.read_bytes()))
+        return path
+
+    return make
+
+
+def forged(content: bytes) -> bytes:
+    """Metadata that aren't JSON, with the right digest."""
+    kept = content.replace(b'"key":', b'"key";')[: -storage._DIGEST_SIZE]
+    return kept + storage._digest(kept)
+
+
+def too_many_samples(s: Surroundings) -> None:
+    s.patch.setattr(film, "MAX_LANES", 32 * 24 * 8)
+    ours = integrator("one_level_path", sampler="independent", patches=64)
+    ours.render(load(room()), spp=9)
+
+
+def hide(s: Surroundings) -> Path:
+    path = s.public / "state.exr"
+    path.write_bytes(s.state.read_bytes())
+    path.chmod(0)
+    return path
+
+
+def read_hidden(s: Surroundings) -> None:
+    path = hide(s)
+    with unprivileged():
+        storage.read(path, "make it again")
+
+
+def write_protected(s: Surroundings) -> None:
+    s.public.chmod(0o555)
+    with unprivileged():
+        check_writable(s.public / "state.exr")
+
+
+def fill_the_disk(s: Surroundings) -> None:
+    with replacing(s.folder / "state.exr"):
+        raise OSError(28, "No space left on device")
+
+
+def command_line(**options: object) -> argparse.Namespace:
+    defaults = {"mode": "llvm_ad_rgb", "threads": None, "define": [], "set": [], "debug": False}
+    defaults |= {"integrator": None, "sensor": 0, "spp": 1, "seed": 0, "png": False}
+    return argparse.Namespace(**defaults | {"denoise": False} | options)
+
+
+def shell(command: Callable, **options: object) -> Callable:
+    """A command, of a scene of a ball under a grey sky."""
+
+    def action(s):
+        path = s.folder / "ball.xml"
+        path.write_text(
+            '<scene version="3.0.0"> <sensor type="perspective"> <film type="hdrfilm">'
+            '<string name="pixel_format" value="luminance"/> <integer name="width" value="4"/>'
+            '<integer name="height" value="4"/> </film> </sensor> <integrator type="path"/>'
+            '<shape type="sphere"/> <emitter type="constant"/> </scene>'
+        )
+        output = s.folder / options.get("output", "ball.exr")
+        command(command_line(scene=path, **options | {"output": output}))
+
+    return action
+
+
+def xml(text: str) -> Callable:
+    def action(s):
+        path = s.folder / "scene.xml"
+        path.write_text(text)
+        SceneFile(path)
+
+    return action
+
+
+def without_denoiser(s: Surroundings) -> None:
+    s.patch.setitem(sys.modules, "mitsuba_oidn", None)
+    warm_up(4, 4)
+
+
+def old_llvm(s: Surroundings) -> None:
+    s.patch.setattr(dr.detail, "llvm_version", lambda: (15, 0, 6))
+    ensure_llvm()
+
+
+def little_memory(action: Callable, free: float = 1e9) -> Callable:
+    def run(s):
+        for module in (memory, storage):
+            s.patch.setattr(module, "free_memory", lambda: free)
+        action(s)
+
+    return run
+
+
+def other_variant(s: Surroundings) -> None:
+    s.patch.setattr(mi, "variant", lambda: "scalar_rgb")
+    check_variant("envmap_hybrid")
+
+
+def grey_map(parts: dict, metadata: dict) -> None:
+    """Maps of one colour channel instead of three."""
+    for name in [name for name in parts if name.startswith("map")]:
+        parts[name] = {"Y": parts[name]["R"], "inverse_distance": parts[name]["inverse_distance"]}
+
+
+def half_map(parts: dict, metadata: dict) -> None:
+    parts["map0/level0"] = {c: image[:2].copy() for c, image in parts["map0/level0"].items()}
+
+
+def wrong_rows(parts: dict, metadata: dict) -> None:
+    parts["source_rows"]["row"][:] = 10**6
+
+
+def no_maps(parts: dict, metadata: dict) -> None:
+    metadata["maps"] = []
+
+
+def setting(name: str, value: object, entry: str | None = None) -> Callable:
+    def change(parts, metadata):
+        (metadata[entry][0] if entry else metadata)[name] = value
+
+    return change
+
+
+AGAIN = "make it again with envmap-render bake"
+STATE = '"cache_file" {folder}/altered.exr'
+CASES = {
+    # ---- Parameters ----
+    "integer": Case(parameter("integer", 2.5, 1, 1), '"ours": "x"', "2.5", "must be an integer"),
+    "power": Case(parameter("power_of_two", 3, 1, 1, 8), '"x"', "3", "must be a power of two"),
+    "number": Case(parameter("number", "a", 1.0, 0.0), '"x"', "'a'", "must be a number"),
+    "flag": Case(parameter("flag", 3, True), '"x"', "3", "must be true or false"),
+    "choice": Case(parameter("choice", "c", "a", ("a", "b")), '"x"', "'c'", '"a" or "b"'),
+    "text": Case(parameter("text", 3), '"x"', "3", "must be a string"),
+    "range": Case(parameter("integer", 9, 1, 1, 8), '"x"', "9", "at least 1 and at most 8"),
+    "nested": Case(
+        lambda _: integrator("envmap_hybrid", cube={"type": "point"}),
+        "envmap_hybrid", 'PointLight "cube"', "must be one envmap_bake or a mipmap_cube",
+    ),
+    "to_world": Case(
+        lambda _: emitter(shapes="a", to_world=mi.ScalarTransform4f())(_),
+        'mipmap_cube "sky"', '"to_world"', "remove it",
+    ),
+    "neither": Case(emitter(), 'mipmap_cube "sky"', "neither", 'give either "filename"'),
+    "both": Case(
+        emitter(shapes="a", filename=lambda s: s.state), '"sky"', "both", 'give either "filename"'
+    ),
+    "no ids": Case(emitter(shapes=" , "), '"sky": "shapes"', "' , '", "must list ids"),
+    # ---- Scenes ----
+    "no surfaces": Case(
+        lambda _: check_scene(load({"type": "scene", "sky": {"type": "constant"}}), "ours"),
+        "ours", "the scene has no surfaces", "add a shape",
+    ),
+    "no emitters": Case(scene(lamp=None), "ours", "the scene has no emitters", "add one"),
+    "medium": Case(
+        scene(fog=ball(0, 0, 0, 0.3) | {"interior": MEDIUM}),
+        'shape "fog"', 'HomogeneousMedium as "interior"', "remove it or use volpath",
+    ),
+    "camera in a medium": Case(
+        lambda s: scene(sensor=camera(medium=MEDIUM))(s),
+        'sensor "sensor"', "medium", "remove it or use volpath",
+    ),
+    "unknown shape": Case(listed("bal"), 'mipmap_cube "desk"', '"bal"', "optimize=False"),
+    "listed twice": Case(listed("ball", "ball"), '"desk"', '"ball" is listed twice', "list it "),
+    "no points": Case(listed("lamp"), '"desk"', '"lamp"', "list shapes that aren't empty"),
+    # ---- The machine ----
+    "variant": Case(other_variant, "envmap_hybrid", "variant scalar_rgb", "use one of llvm_ad_rgb"),
+    "llvm": Case(old_llvm, "llvm_* variants", "LLVM 15", "need LLVM 17 or newer: "),
+    "denoiser": Case(without_denoiser, "the denoiser", "is missing", "pip install mitsuba-oidn"),
+    "samples": Case(
+        too_many_samples, '"sampler" independent', "not 9", "leave it out to take any number"
+    ),
+    "patches": Case(
+        little_memory(lambda s: integrator("envmap_hybrid", patches=10**6).prepare(load(room()))),
+        "envmap_hybrid", "1000000 patches with 32 samples each need 10.3 GB, 1.0 GB are free",
+        'lower "patches" or "patch_samples"',
+    ),
+    "maps": Case(
+        little_memory(
+            lambda s: integrator("envmap_hybrid", **SETTINGS | {"map_resolution": 2048}).prepare(
+                load(room())
+            )
+        ),
+        "envmap_hybrid", "1 maps of 2048 x 2048 texels a face need 3.3 GB, 1.0 GB are free",
+        'lower "map_resolution" or list fewer clusters',
+    ),
+    # ---- Files that are read ----
+    "a large file": Case(
+        little_memory(use(lambda s: s.state), 1000), '"cache_file" {state}', "0.0 GB that are free",
+        "close other programs",
+    ),
+    "no file": Case(use(lambda s: s.folder / "none.exr"), "none.exr", "no such file", AGAIN),
+    "unreadable": Case(read_hidden, "{public}/state.exr", "Permission denied", "make it again"),
+    "damaged": Case(use(with_bytes(lambda b: b[:-9])), STATE, "truncated or damaged", AGAIN),
+    "no EXR": Case(use(with_bytes(lambda b: b"text")), STATE, "no OpenEXR file", AGAIN),
+    "not ours": Case(
+        use(with_bytes(lambda b: b.replace(b"envmap_integrator", b"envmap_integratos"))),
+        STATE, "not a file of envmap_integrator", AGAIN,
+    ),
+    "format": Case(
+        use(with_bytes(lambda b: b.replace(b'{"format": 3', b'{"format": 9'))),
+        STATE, "written in format 9, this version reads format 3", AGAIN,
+    ),
+    "forged": Case(use(with_bytes(forged)), STATE, "not as this version writes", AGAIN),
+    "another scene": Case(use(altered(setting("key", "a b"))), STATE, "another scene", AGAIN),
+    "sources": Case(
+        use(altered(wrong_rows)), STATE, "rows for 1 emitters", AGAIN
+    ),
+    "map channels": Case(use(altered(grey_map)), STATE, "haven't 3 colour channels", AGAIN),
+    "short": Case(use(altered(setting("patches", 10**6))), STATE, "values of 1000000", AGAIN),
+    "clusters": Case(use(altered(no_maps)), STATE, "more than its 0 maps", AGAIN),
+    "map resolution": Case(
+        use(altered(setting("resolution", 3, "maps"))), STATE, '"resolution"', AGAIN
+    ),
+    "map size": Case(use(altered(half_map)), STATE, '"map0/level0" has another size', AGAIN),
+    "no part": Case(
+        use(altered(lambda parts, _: parts.pop("levels"))), STATE, 'no part "levels"', AGAIN
+    ),
+    "value": Case(use(altered(setting("size", "big"))), STATE, "not 'big'", AGAIN),
+    "unknown map": Case(
+        emitter(filename=lambda s: s.state, map="sofa"), "{state}", '"sofa", only desk', "name one"
+    ),
+    "no maps": Case(
+        emitter(filename=altered(no_maps)), 'mipmap_cube "sky": {folder}/altered.exr',
+        "holds no maps", 'set "maps" to "always"',
+    ),
+    "map of another variant": Case(
+        emitter(filename=altered(grey_map)),
+        "mipmap_cube", "1 colour channels, variant llvm_ad_rgb needs 3", "bake it with this",
+    ),
+    # ---- Files that are written ----
+    "no folder": Case(
+        lambda s: check_writable(s.folder / "a" / "b.exr"), "a/b.exr", "no folder", "make it first"
+    ),
+    "a folder": Case(
+        lambda s: check_writable(s.folder), "{folder}", "is a folder", "choose another name"
+    ),
+    "protected": Case(
+        write_protected, "{public}/state.exr", "the folder {public}", "change its permissions or"
+    ),
+    "full": Case(
+        fill_the_disk, "{folder}/state.exr", "No space left on device", "make room there or choose"
+    ),
+    # ---- The shell ----
+    "no scene": Case(
+        lambda s: SceneFile(s.folder / "none.xml"), "scene", "none.xml", "check the path"
+    ),
+    "no root": Case(
+        xml('<bsdf version="3.0.0" type="plastic"/>'), "scene.xml", '"plastic"', "be a <scene>"
+    ),
+    "assignment": Case(lambda _: parse_assignment("a"), '"a"', '"a"', "expected KEY=VALUE"),
+    "spp": Case(shell(commands.render, spp=-1), "--spp", "-1", "must not be negative"),
+    "threads": Case(shell(commands.render, threads=0), "--threads", "0", "must be at least 1"),
+    "mode": Case(shell(commands.render, mode="gpu"), "variant", '"gpu"', "choose from"),
+    "sensor": Case(shell(commands.render, sensor=1), "--sensor", "1", "the scene has 1 sensor(s)"),
+    "output": Case(shell(commands.bake, output="b.png"), "output", "b.png", "must end in .exr"),
+    "no colour": Case(
+        shell(commands.render, denoise=True), "--denoise", "1 channel(s)", "to rgb or rgba"
+    ),
+    "nothing to bake": Case(
+        shell(commands.bake), "integrator", '"path"', "pass --integrator envmap_hybrid"
+    ),
+}  # fmt: skip
+
+
+# ---------------------- What holds for all ----------------------
+
+
+def sites() -> dict[Site, str]:
+    """Where the package raises errors: (file, line) → the statement."""
+    found = {}
+    for path in PACKAGE.rglob("*.py"):
+        source = path.read_text()
+        for node in ast.walk(ast.parse(source)):
+            function = getattr(getattr(node, "func", None), "id", "")
+            if isinstance(node, ast.Raise) or function == "_require":
+                statement = ast.get_source_segment(source, node)
+                if statement not in EXCEPTED:
+                    found[str(path.relative_to(PACKAGE)), node.lineno] = statement
+    return found
+
+
+def raised_by(action: Callable[[], object]) -> list[tuple[Site, str]]:
+    """Where in the package exceptions came by during an action, and their messages.
+
+    On their way through Mitsuba they lose what Python knows of them, so they are watched.
+    """
+    seen = []
+
+    def watch(frame, event, argument):
+        if event == "exception":
+            path = Path(frame.f_code.co_filename).relative_to(PACKAGE)
+            seen.append(((str(path), frame.f_lineno), str(argument[1])))
+        return watch
+
+    def enter(frame, event, argument):
+        return watch if frame.f_code.co_filename.startswith(str(PACKAGE)) else None
+
+    before = sys.gettrace()
+    sys.settrace(enter)
+    try:
+        action()
+    except (ValueError, TypeError, RuntimeError, ImportError, OSError, argparse.ArgumentTypeError):
+        return seen
+    finally:
+        sys.settrace(before)
+    pytest.fail("nothing was raised")
+
+
+SITES = sites()
+_hit: set[Site] = set()
+
+
+@pytest.fixture(scope="module")
+def state(variant, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("state") / "state.exr"
+    integrator("envmap_hybrid", **SETTINGS).prepare(load(room())).save(path)
+    return path
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_message_names_object_value_and_mend(name, tmp_path, public_folder, state, monkeypatch):
+    case = CASES[name]
+    surroundings = Surroundings(tmp_path, public_folder, state, monkeypatch)
+    seen = [
+        (site, message)
+        for site, message in raised_by(lambda: case.action(surroundings))
+        if site in SITES
+    ]
+    assert seen
+    _hit.update(site for site, _ in seen)
+    message = seen[-1][1]
+    for words in (case.object, case.value, case.mend):
+        assert words.format(folder=tmp_path, public=public_folder, state=state) in message
+    assert "\n" not in message and len(message) < 500
+
+
+def test_every_error_has_a_case(request):
+    """Needs the whole module to have run."""
+    module = [item for item in request.session.items if item.path == request.node.path]
+    if len(module) <= len(CASES):
+        pytest.skip("a part of the cases was deselected")
+    missing = {f"{file}:{line}  {SITES[file, line]}" for file, line in SITES.keys() - _hit}
+    assert not missing
