@@ -12,7 +12,7 @@ import numpy as np
 from ..jit import upload
 
 #: Cells of the tabulated inverse of the filter's distribution, and steps of its integration.
-CELLS, STEPS = 1024, 1 << 16
+CELLS, STEPS = 8192, 1 << 14
 
 
 class PixelFilter:
