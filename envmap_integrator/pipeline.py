@@ -34,7 +34,7 @@ from .storage import StorageError, Stored, read, write
 POINTS_PER_PATCH = 24
 #: Memory [bytes] taken at most by a patch of the budget, by each of its gather rays, and by each of
 #: the finest texels of a map, while they are made (measured).
-PATCH_MEMORY, RAY_MEMORY, TEXEL_MEMORY = 9000, 40, 130
+PATCH_MEMORY, RAY_MEMORY, TEXEL_MEMORY = 10000, 40, 130
 
 
 @dataclass(frozen=True)

@@ -150,7 +150,8 @@ def test_shares_of_known_errors():
     exact = [flat + noise(0.2) for _ in range(8)]
     without_left = [one + right + noise(0.02) for one in exact]
     default = [one + left + right for one in exact]
-    judged_by = Reference(flat + noise(0.01), flat + noise(0.01), 1, [1.0, 1.001, 0.999])
+    thirds = tuple(flat + noise(0.01) for _ in range(3))
+    judged_by = Reference(thirds, 1, [1.0, 1.001, 0.999])
     ledger = Ledger(np.subtract(default, exact), judged_by)
 
     whole = (0.3**2 + 0.1**2) / 2 / 1.01
