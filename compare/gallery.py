@@ -52,7 +52,7 @@ NESTED_IN = "envmap_hybrid"
 """The integrator that takes clusters."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Case:
     """A scene that is hard, and what must hold for its picture.
 

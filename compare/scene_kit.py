@@ -106,6 +106,30 @@ def cluster(*shapes: str, distance_ratio: float = 1.5) -> Description:
     return {"type": "mipmap_cube", "shapes": names, "distance_ratio": distance_ratio}
 
 
+PLACEABLE = ("cube", "rectangle", "sphere", "disk", "cylinder")
+"""Plugins that ``placed`` moves."""
+
+
+def placed(scene: Description, scale: float = 1.0, offset=(0.0, 0.0, 0.0)) -> Description:
+    """The scene, scaled about the origin and then moved by ``offset``, as its cameras saw it."""
+    transform = at(*offset) @ scaled(scale)
+    moved = dict(scene)
+    for name, part in scene.items():
+        kind = part["type"] if isinstance(part, dict) else ""
+        if kind in PLACEABLE:
+            moved[name] = part | {"to_world": transform @ part.get("to_world", scaled(1))}
+        elif kind == "perspective":
+            pose = np.array(part["to_world"].matrix)
+            origin, along, up = pose[:3, 3], pose[:3, 2], pose[:3, 1].tolist()
+            origin, target = (
+                (scale * point + offset).tolist() for point in (origin, origin + along)
+            )
+            to_world = mi.ScalarTransform4f().look_at(origin, target, up)
+            near = scale * part["near_clip"]
+            moved[name] = part | {"to_world": to_world, "near_clip": near, "far_clip": 1e7 * scale}
+    return moved
+
+
 # ---------------------- Shapes made of numbers ----------------------
 
 
@@ -115,7 +139,7 @@ def mesh(vertices, faces, normals=None, **properties: Any) -> mi.Mesh:
     props = mi.Properties()
     for name, description in properties.items():
         props[name] = mi.load_dict(description)
-    shape = mi.Mesh("mesh", len(vertices), len(faces), normals is not None, False, props)
+    shape = mi.Mesh("mesh", len(vertices), len(faces), props, normals is not None)
     values = mi.traverse(shape)
     values["vertex_positions"] = vertices.ravel()
     values["faces"] = faces.ravel()

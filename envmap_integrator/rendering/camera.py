@@ -90,8 +90,8 @@ def split(scene, transport, sampler, ray, active, secondary_samples):
     throughput = mi.Spectrum(1)
     if dr.hint(transport.far_field is None or not transport.far_field.map_mirrors, mode="scalar"):
         mirrored = active & si.is_valid() & is_delta(si.bsdf(ray))
-        shown |= mirrored
         si, ray, throughput, solid = follow_mirrors(scene, sampler, si, ray, mirrored)
+        shown |= solid | (mirrored & si.is_valid())
         valid |= solid
 
     # ---------------------- First vertex ----------------------
@@ -120,18 +120,17 @@ def split(scene, transport, sampler, ray, active, secondary_samples):
 
     # ---------------------- Secondary rays ----------------------
 
-    beyond = replace(transport, hide_emitters=False)
     if dr.hint(secondary_samples == 1, mode="scalar"):
         u = sampler.next_1d()
-        arriving, wide, nearness, solid = secondary(scene, beyond, sampler, vertex, u, hit)
+        arriving, wide, nearness, solid = secondary(scene, transport, sampler, vertex, u, hit)
         valid |= solid
     else:
         i = mi.UInt32(0)
         arriving, wide, nearness = mi.Spectrum(0), mi.Spectrum(0), mi.Float(0)
         pending = mi.Bool(hit)
-        while dr.hint(pending, exclude=[beyond, vertex], label="Secondary rays"):
+        while dr.hint(pending, exclude=[transport, vertex], label="Secondary rays"):
             u = (mi.Float(i) + sampler.next_1d()) / mi.Float(secondary_samples)
-            one = secondary(scene, beyond, sampler, vertex, u, pending)
+            one = secondary(scene, transport, sampler, vertex, u, pending)
             arriving += one[0]
             wide += one[1]
             nearness += one[2]
@@ -191,7 +190,7 @@ def secondary(scene, transport, sampler, vertex, u, active):
     """One secondary ray.
 
     Returns the radiance [W/m²/sr] that it brings, the part of it by wide lobes, the inverse
-    distance [1/m] to where they were traced, and whether the surface is solid.
+    distance [1/m] to where they were traced, and whether anything was solid.
     """
     si = vertex.si
     bs, weight = vertex.bsdf.sample(mi.BSDFContext(), si, u, sampler.next_2d(), active)
@@ -207,6 +206,7 @@ def secondary(scene, transport, sampler, vertex, u, active):
         bounded=mi.Bool(False),
         cluster=mi.UInt32(0),
         reach=mi.Float(dr.inf),
+        solid=active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null),
     )
     if vertex.cube is not None:
         start.cluster = vertex.cube.cluster
@@ -214,7 +214,6 @@ def secondary(scene, transport, sampler, vertex, u, active):
             vertex.cube, start.ray, wide, sampler.next_1d(), active
         )
     end = follow(scene, transport, sampler, start, active & (dr.max(weight) > 0))
-    solid = active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
     arriving = weight * end.radiance
     nearness = dr.rcp(dr.minimum(end.distance, start.ray.maxt))
-    return arriving, dr.select(wide, arriving, 0), dr.select(wide, nearness, 0), end.valid | solid
+    return arriving, dr.select(wide, arriving, 0), dr.select(wide, nearness, 0), end.valid
