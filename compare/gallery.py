@@ -48,8 +48,8 @@ CONFIDENCE = 0.9999
 """Of the interval of the mean's error: in 300 comparisons, 3 % of correct ones would have one that
 fails."""
 
-NESTED_IN = "envmap_hybrid"
-"""The integrator that takes clusters."""
+MAPPING = "envmap_hybrid"
+"""The integrator that makes maps."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ class Case:
     brightest    radiance [W/m²/sr] that no pixel may exceed
     bias         integrator → relative error of the mean that its method may leave
     precision    the widest half interval of that error with which a comparison means anything
-    cubes        clusters, nested in the integrator that takes them
+    maps         clusters and other settings of the integrator that makes maps
     settings     of every integrator, ``path`` too
     own          of our integrators only
     spp          samples per pixel
@@ -74,7 +74,7 @@ class Case:
     brightest: float = math.inf
     bias: Mapping[str, float] = field(default_factory=dict)
     precision: float = 0.02
-    cubes: Mapping[str, Description] = field(default_factory=dict)
+    maps: Mapping[str, Any] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
     own: Mapping[str, Any] = field(default_factory=dict)
     spp: int = 16
@@ -94,8 +94,8 @@ class Case:
         """``path`` or one of ours, with its defaults but for what the case is about."""
         if name == "path":
             return mi.load_dict({"type": name, **self.settings})
-        cubes = self.cubes if name == NESTED_IN else {}
-        return mi.load_dict({"type": name, **self.settings, **self.own, **cubes})
+        maps = self.maps if name == MAPPING else {}
+        return mi.load_dict({"type": name, **self.settings, **self.own, **maps})
 
 
 @dataclass(frozen=True)

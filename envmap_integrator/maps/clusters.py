@@ -93,7 +93,7 @@ def listed_clusters(
             mi.Log(
                 mi.LogLevel.Warn,
                 f"{owner}: no surface that could use a map was found on "
-                f'{_some(request.shape_ids)}, so there is none; mirrors and glass are traced '
+                f"{_some(request.shape_ids)}, so there is none; mirrors and glass are traced "
                 'unless "mirrors" is "map"',
             )
             continue

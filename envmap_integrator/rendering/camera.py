@@ -51,6 +51,14 @@ class CameraSample:
         gathered = self.gathered and self.gathered.scaled(factor)
         return replace(self, radiance=factor * self.radiance, gathered=gathered)
 
+    def finite(self) -> CameraSample:
+        """The same, but black where it isn't finite: materials give what isn't where shading
+        normals aren't, and a single sample would spoil its pixel.
+        """
+        known = dr.all(dr.isfinite(self.radiance))
+        gathered = self.gathered and self.gathered.where(known)
+        return replace(self, radiance=dr.select(known, self.radiance, 0), gathered=gathered)
+
 
 def camera_radiance(
     scene: mi.Scene,
@@ -66,8 +74,8 @@ def camera_radiance(
     """
     if transport.gather_depth == 0:
         end = follow(scene, transport, sampler, camera_path(ray), active)
-        return CameraSample(end.radiance, end.distance, end.valid)
-    return split(scene, transport, sampler, ray, active, secondary_samples)
+        return CameraSample(end.radiance, end.distance, end.valid).finite()
+    return split(scene, transport, sampler, ray, active, secondary_samples).finite()
 
 
 @dr.syntax
@@ -87,10 +95,10 @@ def split(scene, transport, sampler, ray, active, secondary_samples):
     distance = dr.select(active & si.is_valid(), si.t, dr.inf)
     shown = active & (not transport.hide_emitters)
     valid = shown & (scene.environment() is not None)
-    throughput = mi.Spectrum(1)
+    throughput, on_mirrors = mi.Spectrum(1), mi.Spectrum(0)
     if dr.hint(transport.far_field is None or not transport.far_field.map_mirrors, mode="scalar"):
         mirrored = active & si.is_valid() & is_delta(si.bsdf(ray))
-        si, ray, throughput, solid = follow_mirrors(scene, sampler, si, ray, mirrored)
+        si, ray, throughput, on_mirrors, solid = follow_mirrors(scene, sampler, si, ray, mirrored)
         shown |= solid | (mirrored & si.is_valid())
         valid |= solid
 
@@ -141,19 +149,22 @@ def split(scene, transport, sampler, ray, active, secondary_samples):
         wide /= secondary_samples
         nearness /= secondary_samples
     gathered = gathering(scene, si, bsdf, wide, nearness, smooth)
-    return CameraSample(radiance + arriving, distance, valid, gathered).scaled(throughput)
+    seen = CameraSample(radiance + arriving, distance, valid, gathered).scaled(throughput)
+    return replace(seen, radiance=seen.radiance + on_mirrors)
 
 
 @dr.syntax
 def follow_mirrors(scene, sampler, si, ray, active):
     """Follow perfect mirrors and glass to what is seen in them.
 
-    Returns an interaction, invalid where nothing is seen, the ray to it, the throughput, and
-    whether anything on the way was solid.
+    Returns an interaction, invalid where nothing is seen, the ray to it, the throughput, what the
+    mirrors and the glass themselves emit [W/m²/sr], and whether anything on the way was solid.
     """
     si, ray, active = mi.SurfaceInteraction3f(si), mi.Ray3f(ray), mi.Bool(active)
     throughput, eta, bounces, solid = mi.Spectrum(1), mi.Float(1), mi.UInt32(0), mi.Bool(False)
+    emitted = mi.Spectrum(0)
     while dr.hint(active, label="Follow mirrors"):
+        emitted += throughput * si.emitter(scene).eval(si, active)
         bs, weight = si.bsdf(ray).sample(
             mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active
         )
@@ -169,7 +180,7 @@ def follow_mirrors(scene, sampler, si, ray, active):
         count(Ray.UNBOUNDED, ray, active)
         si = dr.select(active, scene.ray_intersect(ray, active), si)
         active &= si.is_valid() & is_delta(si.bsdf(ray))
-    return si, ray, throughput, solid
+    return si, ray, throughput, emitted, solid
 
 
 def gathering(scene, si, bsdf, radiance, nearness, active) -> Gathered:

@@ -207,7 +207,9 @@ def follow(
     weight = mi.Spectrum(0)
     row = mi.UInt32(0)
     # As in path, a visible environment is never transparent.
-    valid = start.solid | (active & (scene.environment() is not None and not transport.hide_emitters))
+    valid = start.solid | (
+        active & (scene.environment() is not None and not transport.hide_emitters)
+    )
     distance = mi.Float(dr.inf)
     going_on = mi.Float(0)  # Probability of going on where the cache or a map could end the path
     lane = dr.arange(mi.UInt32, dr.width(ray))
