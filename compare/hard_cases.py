@@ -386,10 +386,15 @@ CUBES = {
 # ---------------------- Scale, place, meshes ----------------------
 
 GEOMETRY = {
-    "tiny": Case(lambda: placed(small_room(), 1e-4), ROOM, maps=BOTH),
-    "huge": Case(lambda: placed(small_room(), 1e5), ROOM, maps=BOTH),
+    "1/10,000 of the size": Case(lambda: placed(small_room(), 1e-4), ROOM, maps=BOTH),
+    "1/100 of the size": Case(lambda: placed(small_room(), 1e-2), ROOM, maps=BOTH),
+    "1,000 times the size": Case(lambda: placed(small_room(), 1e3), ROOM, maps=BOTH),
+    "100,000 times the size": Case(lambda: placed(small_room(), 1e5), ROOM, maps=BOTH),
     "far from the origin": Case(
         lambda: placed(small_room(), offset=(3000, -2000, 1000)), ROOM, maps=BOTH
+    ),
+    "10,000 rooms from the origin": Case(
+        lambda: placed(small_room(), offset=(4e4, 0, 0)), ROOM, maps=BOTH
     ),
     "zero-area triangles": Case(lambda: pyramid([[0, 0, 0], [0, 1, 0], [4, 4, 2]]), ROOM),
     "normals that are no numbers": Case(broken_normals, ROOM),

@@ -40,6 +40,9 @@ SIGMAS = 6
 SIZE = 8
 #: Seconds after which a scene counts as hanging; compilation takes a few.
 HANGS_AFTER = 300
+#: Mitsuba starts rays 1e-4 off surfaces, also where that is as large as the scene: pictures of
+#: smaller scenes than this, those of ``path`` too, aren't those of the scene.
+TINIEST = 1e-3
 #: Walls no brighter than this let the light of a closed scene die out soon.
 WHITEST_WALL = 0.9
 
@@ -518,6 +521,8 @@ def check(recipe: Recipe) -> None:
     hidden = recipe["parameters"].get("hide_emitters", False)
     if hidden and "mask" in json.dumps(recipe):
         return  # Of what a mask reflects, path hides the part that it lets through to the sky, too.
+    if recipe["scale"] < TINIEST:
+        return
     path = mi.load_dict({"type": "path", "hide_emitters": hidden})
     if not np.isfinite(np.array(mi.render(scene, integrator=path, spp=16))).all():
         return  # Normals that are no numbers, for example.
