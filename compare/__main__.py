@@ -15,6 +15,7 @@ from compare.experiments import (
     complexity,
     distance,
     error_vs_time,
+    gallery,
     render,
     resolution,
 )
@@ -29,6 +30,7 @@ EXPERIMENTS: dict[str, ModuleType] = {
     "error-vs-time": error_vs_time,
     "complexity": complexity,
     "bias": bias,
+    "gallery": gallery,
     "render": render,
 }
 """Each module has ``Options`` and ``run(options, folder)``; its docstring is the help."""

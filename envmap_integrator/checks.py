@@ -25,7 +25,8 @@ def check_variant(plugin: str) -> None:
 def check_scene(scene: mi.Scene, owner: str) -> None:
     """Stop at scenes that would render black or wrong.
 
-    Raises ``ValueError`` for scenes without surfaces or emitters and for participating media.
+    Raises ``ValueError`` for scenes without surfaces or emitters, for meshes without faces, which
+    Mitsuba's kernels can't read, and for participating media.
     Media that only absorb, as in tinted glass, are ignored with a warning: ``path``, the reference,
     ignores all media.
     """
@@ -34,6 +35,8 @@ def check_scene(scene: mi.Scene, owner: str) -> None:
     if not scene.emitters():
         raise ValueError(f"{owner}: the scene has no emitters, all would be black; add one")
     for shape in scene.shapes():
+        if isinstance(shape, mi.Mesh) and shape.face_count() == 0:
+            raise ValueError(f'{owner}: shape "{shape.id()}" is a mesh without faces; remove it')
         for name in ("interior", "exterior"):
             medium = getattr(shape, f"{name}_medium")()
             if medium is None:

@@ -22,6 +22,7 @@ LAYERS = {
     "unit": "one module, without a render",
     "system": "the plugins and the command line, end to end",
     "regression": "pictures and figures against stored or reference ones",
+    "fuzz": "random scenes",
 }
 DEFAULT_VARIANT = "llvm_ad_rgb"
 #: Folder of third-party scenes, each in a folder of its own: too large to keep here.

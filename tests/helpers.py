@@ -14,6 +14,23 @@ import mitsuba as mi
 import numpy as np
 
 import envmap_integrator  # noqa: F401  (registers the plugins)
+from compare.scene_kit import (  # noqa: F401  (tests have them from here)
+    Description,
+    at,
+    ball,
+    block,
+    box,
+    camera,
+    cluster,
+    colour,
+    emitting,
+    film,
+    grey,
+    lamp,
+    open_scene,
+    room,
+    scaled,
+)
 
 ROOT = Path(__file__).parents[1]
 SCENES = ROOT / "scenes"
@@ -23,89 +40,7 @@ QUANTILE = 4.0
 #: Patches that suffice for a small room.
 PATCHES = 2048
 
-Description = dict[str, Any]
-
 # ---------------------- Scenes ----------------------
-
-
-def room(**changes: Any) -> Description:
-    """A closed grey room, 4 wide, with a lamp under its ceiling, a block and a ball on the floor.
-
-    ``changes`` add to its parts or replace them; None removes a part.
-    """
-    parts = {
-        "type": "scene",
-        "sensor": camera(),
-        "walls": box(2.0) | grey(0.5),
-        "lamp": lamp(z=1.9),
-        "block": block(-0.5, 0.6, -1.5, 0.4) | grey(0.7),
-        "ball": ball(0.4, 0.2, -1.6, 0.4) | grey(0.6, 0.3, 0.2),
-    } | changes
-    return {name: part for name, part in parts.items() if part is not None}
-
-
-def open_scene(**changes: Any) -> Description:
-    """The block and the ball on a large floor under the open sky."""
-    floor = {"type": "rectangle", "to_world": at(0, 0, -2) @ scaled(6)} | grey(0.5)
-    return room(**{"walls": None, "lamp": None, "floor": floor} | changes)
-
-
-def camera(
-    width: int = 32, height: int = 24, origin=(0, -1.8, 0.4), target=(0, 0.5, -1), **more: Any
-) -> Description:
-    """A sensor whose pixels are independent of each other, as the statistics below ask for."""
-    return {
-        "type": "perspective",
-        "fov": 80,
-        "near_clip": 1e-6 * max(map(abs, origin)),
-        "far_clip": 1e7,
-        "to_world": mi.ScalarTransform4f().look_at(origin, target, up=[0, 0, 1]),
-        "sampler": {"type": "independent"},
-        "film": film(width, height),
-    } | more
-
-
-def film(width: int, height: int, **more: Any) -> Description:
-    return {
-        "type": "hdrfilm",
-        "width": width,
-        "height": height,
-        "rfilter": {"type": "box"},
-        "pixel_format": "rgb",
-    } | more
-
-
-def box(half_width: float) -> Description:
-    """A closed box seen from inside."""
-    return {"type": "cube", "to_world": scaled(half_width), "flip_normals": True}
-
-
-def block(x: float, y: float, z: float, half_width: float) -> Description:
-    return {"type": "cube", "to_world": at(x, y, z) @ scaled(half_width)}
-
-
-def ball(x: float, y: float, z: float, radius: float) -> Description:
-    return {"type": "sphere", "center": [x, y, z], "radius": radius}
-
-
-def lamp(x: float = 0, y: float = 0, z: float = 0, half_width: float = 0.5, power: float = 10):
-    """A black square that shines downwards."""
-    turned = mi.ScalarTransform4f().rotate([1, 0, 0], 180)
-    shape = {"type": "rectangle", "to_world": at(x, y, z) @ turned @ scaled(half_width)}
-    return shape | grey(0) | emitting(power)
-
-
-def grey(*reflectance: float) -> Description:
-    """A diffuse material: a grey, or red, green, blue."""
-    return {"bsdf": {"type": "diffuse", "reflectance": colour(*reflectance)}}
-
-
-def emitting(*radiance: float) -> Description:
-    return {"emitter": {"type": "area", "radiance": colour(*radiance)}}
-
-
-def colour(*value: float) -> Description:
-    return {"type": "rgb", "value": list(value) if len(value) > 1 else value[0]}
 
 
 @contextmanager
@@ -131,20 +66,6 @@ def at_most(size: int) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-
-
-def at(x: float, y: float, z: float) -> mi.ScalarTransform4f:
-    return mi.ScalarTransform4f().translate([x, y, z])
-
-
-def scaled(factor: float) -> mi.ScalarTransform4f:
-    return mi.ScalarTransform4f().scale(factor)
-
-
-def cluster(*shapes: str, distance_ratio: float = 1.5) -> Description:
-    """A nested ``mipmap_cube`` that asks for a cluster."""
-    names = ", ".join(shapes or ("block", "ball"))
-    return {"type": "mipmap_cube", "shapes": names, "distance_ratio": distance_ratio}
 
 
 def load(description: Description) -> mi.Scene:

@@ -74,7 +74,7 @@ class EnvmapHybrid(CachedIntegrator):
        - |float|
        - Probability of tracing on where the cache or a map could end a path, to correct what they
          get wrong. Above 0 the mean is that of :monosp:`path`: there is no bias, but more
-         noise. (Default: 0)
+         noise, and pixels of few samples may fall below zero. (Default: 0)
      * - irradiance_filter
        - |bool|
        - Let neighbouring pixels share the indirect light that diffuse surfaces gather, where it

@@ -65,9 +65,11 @@ def listed_clusters(
 ) -> tuple[list[Cluster], np.ndarray]:
     """The clusters that the user listed, and the cluster of every surface point [N], -1 if none.
 
-    One whose cube holds the whole scene is left out with a warning: it has nothing to map. Of
-    shapes in several spaces, only what lies in the one where most is seen belongs to it.
-    Raises ``ValueError`` if a shape isn't in the scene, is listed twice or has no surface.
+    Left out with a warning: one whose cube holds the whole scene, so that there is nothing to map,
+    and one without surface points, so that nothing would look its map up: empty, too small to be
+    found, or of mirrors and glass, which are traced. Of shapes in several spaces, only what lies in
+    the one where most is seen belongs to it.
+    Raises ``ValueError`` if a shape isn't in the scene or is listed twice.
     """
     ids = [shape.id() for shape in ordered_shapes(scene)]
     clusters = []
@@ -88,10 +90,13 @@ def listed_clusters(
             listed[shape] = members[shape] = True
         member = members[points.object_id]
         if not member.any():
-            raise ValueError(
-                f"{owner}: no surface was found on {_some(request.shape_ids)}; list shapes that "
-                "aren't empty"
+            mi.Log(
+                mi.LogLevel.Warn,
+                f"{owner}: no surface that could use a map was found on "
+                f"{_some(request.shape_ids)}, so there is none; mirrors and glass are traced "
+                'unless "mirrors" is "map"',
             )
+            continue
         if (space[member] >= 0).any():
             member &= space == np.bincount(space[member & (space >= 0)]).argmax()
         ratio = request.distance_ratio or distance_ratio

@@ -51,6 +51,14 @@ class CameraSample:
         gathered = self.gathered and self.gathered.scaled(factor)
         return replace(self, radiance=factor * self.radiance, gathered=gathered)
 
+    def finite(self) -> CameraSample:
+        """The same, but black where it isn't finite: materials give what isn't where shading
+        normals aren't, and a single sample would spoil its pixel.
+        """
+        known = dr.all(dr.isfinite(self.radiance))
+        gathered = self.gathered and self.gathered.where(known)
+        return replace(self, radiance=dr.select(known, self.radiance, 0), gathered=gathered)
+
 
 def camera_radiance(
     scene: mi.Scene,
@@ -66,8 +74,8 @@ def camera_radiance(
     """
     if transport.gather_depth == 0:
         end = follow(scene, transport, sampler, camera_path(ray), active)
-        return CameraSample(end.radiance, end.distance, end.valid)
-    return split(scene, transport, sampler, ray, active, secondary_samples)
+        return CameraSample(end.radiance, end.distance, end.valid).finite()
+    return split(scene, transport, sampler, ray, active, secondary_samples).finite()
 
 
 @dr.syntax
@@ -87,11 +95,11 @@ def split(scene, transport, sampler, ray, active, secondary_samples):
     distance = dr.select(active & si.is_valid(), si.t, dr.inf)
     shown = active & (not transport.hide_emitters)
     valid = shown & (scene.environment() is not None)
-    throughput = mi.Spectrum(1)
+    throughput, on_mirrors = mi.Spectrum(1), mi.Spectrum(0)
     if dr.hint(transport.far_field is None or not transport.far_field.map_mirrors, mode="scalar"):
         mirrored = active & si.is_valid() & is_delta(si.bsdf(ray))
-        shown |= mirrored
-        si, ray, throughput, solid = follow_mirrors(scene, sampler, si, ray, mirrored)
+        si, ray, throughput, on_mirrors, solid = follow_mirrors(scene, sampler, si, ray, mirrored)
+        shown |= solid | (mirrored & si.is_valid())
         valid |= solid
 
     # ---------------------- First vertex ----------------------
@@ -120,18 +128,17 @@ def split(scene, transport, sampler, ray, active, secondary_samples):
 
     # ---------------------- Secondary rays ----------------------
 
-    beyond = replace(transport, hide_emitters=False)
     if dr.hint(secondary_samples == 1, mode="scalar"):
         u = sampler.next_1d()
-        arriving, wide, nearness, solid = secondary(scene, beyond, sampler, vertex, u, hit)
+        arriving, wide, nearness, solid = secondary(scene, transport, sampler, vertex, u, hit)
         valid |= solid
     else:
         i = mi.UInt32(0)
         arriving, wide, nearness = mi.Spectrum(0), mi.Spectrum(0), mi.Float(0)
         pending = mi.Bool(hit)
-        while dr.hint(pending, exclude=[beyond, vertex], label="Secondary rays"):
+        while dr.hint(pending, exclude=[transport, vertex], label="Secondary rays"):
             u = (mi.Float(i) + sampler.next_1d()) / mi.Float(secondary_samples)
-            one = secondary(scene, beyond, sampler, vertex, u, pending)
+            one = secondary(scene, transport, sampler, vertex, u, pending)
             arriving += one[0]
             wide += one[1]
             nearness += one[2]
@@ -142,19 +149,22 @@ def split(scene, transport, sampler, ray, active, secondary_samples):
         wide /= secondary_samples
         nearness /= secondary_samples
     gathered = gathering(scene, si, bsdf, wide, nearness, smooth)
-    return CameraSample(radiance + arriving, distance, valid, gathered).scaled(throughput)
+    seen = CameraSample(radiance + arriving, distance, valid, gathered).scaled(throughput)
+    return replace(seen, radiance=seen.radiance + on_mirrors)
 
 
 @dr.syntax
 def follow_mirrors(scene, sampler, si, ray, active):
     """Follow perfect mirrors and glass to what is seen in them.
 
-    Returns an interaction, invalid where nothing is seen, the ray to it, the throughput, and
-    whether anything on the way was solid.
+    Returns an interaction, invalid where nothing is seen, the ray to it, the throughput, what the
+    mirrors and the glass themselves emit [W/m²/sr], and whether anything on the way was solid.
     """
     si, ray, active = mi.SurfaceInteraction3f(si), mi.Ray3f(ray), mi.Bool(active)
     throughput, eta, bounces, solid = mi.Spectrum(1), mi.Float(1), mi.UInt32(0), mi.Bool(False)
+    emitted = mi.Spectrum(0)
     while dr.hint(active, label="Follow mirrors"):
+        emitted += throughput * si.emitter(scene).eval(si, active)
         bs, weight = si.bsdf(ray).sample(
             mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active
         )
@@ -170,7 +180,7 @@ def follow_mirrors(scene, sampler, si, ray, active):
         count(Ray.UNBOUNDED, ray, active)
         si = dr.select(active, scene.ray_intersect(ray, active), si)
         active &= si.is_valid() & is_delta(si.bsdf(ray))
-    return si, ray, throughput, solid
+    return si, ray, throughput, emitted, solid
 
 
 def gathering(scene, si, bsdf, radiance, nearness, active) -> Gathered:
@@ -191,7 +201,7 @@ def secondary(scene, transport, sampler, vertex, u, active):
     """One secondary ray.
 
     Returns the radiance [W/m²/sr] that it brings, the part of it by wide lobes, the inverse
-    distance [1/m] to where they were traced, and whether the surface is solid.
+    distance [1/m] to where they were traced, and whether anything was solid.
     """
     si = vertex.si
     bs, weight = vertex.bsdf.sample(mi.BSDFContext(), si, u, sampler.next_2d(), active)
@@ -207,6 +217,7 @@ def secondary(scene, transport, sampler, vertex, u, active):
         bounded=mi.Bool(False),
         cluster=mi.UInt32(0),
         reach=mi.Float(dr.inf),
+        solid=active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null),
     )
     if vertex.cube is not None:
         start.cluster = vertex.cube.cluster
@@ -214,7 +225,6 @@ def secondary(scene, transport, sampler, vertex, u, active):
             vertex.cube, start.ray, wide, sampler.next_1d(), active
         )
     end = follow(scene, transport, sampler, start, active & (dr.max(weight) > 0))
-    solid = active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
     arriving = weight * end.radiance
     nearness = dr.rcp(dr.minimum(end.distance, start.ray.maxt))
-    return arriving, dr.select(wide, arriving, 0), dr.select(wide, nearness, 0), end.valid | solid
+    return arriving, dr.select(wide, arriving, 0), dr.select(wide, nearness, 0), end.valid

@@ -58,6 +58,11 @@ class Gathered:
         """The same, seen with a throughput or a weight of the sensor [1]."""
         return replace(self, radiance=factor * self.radiance, albedo=factor * self.albedo)
 
+    def where(self, mask: mi.Bool) -> Gathered:
+        """The same where ``mask`` is set, and no surface elsewhere."""
+        values = (dr.select(mask, getattr(self, name), 0) for name in self.CHANNELS)
+        return Gathered(*values)
+
     @classmethod
     def count(cls) -> int:
         """Number of channels."""

@@ -117,6 +117,8 @@ class PathState:
     reach           distance [world units] up to which the ray counts the sources that it hits;
                     shadow rays alone count those beyond
     primary         whether its first ray is what a sensor or a texel sees
+    solid           whether it has met more than what lets light straight through: else the sky
+                    isn't shown if sources are hidden
     """
 
     ray: mi.Ray3f
@@ -129,6 +131,7 @@ class PathState:
     cluster: mi.UInt32
     reach: mi.Float
     primary: bool = False
+    solid: mi.Bool | bool = False
 
 
 @dataclass
@@ -187,7 +190,7 @@ def follow(
     ctx = mi.BSDFContext()
     patches = transport.patches
     far_field = transport.far_field
-    hide_emitters = transport.hide_emitters
+    hide_emitters = transport.hide_emitters and start.primary
     cache, residual = transport.cache, transport.residual
 
     # ---------------------- Loop state ----------------------
@@ -209,7 +212,9 @@ def follow(
     weight = mi.Spectrum(0)
     row = mi.UInt32(0)
     # As in path, a visible environment is never transparent.
-    valid = active & (scene.environment() is not None and not hide_emitters)
+    valid = start.solid | (
+        active & (scene.environment() is not None and not transport.hide_emitters)
+    )
     distance = mi.Float(dr.inf)
     going_on = mi.Float(0)  # Probability of going on where the cache or a map could end the path
     lane = dr.arange(mi.UInt32, dr.width(ray))
@@ -267,6 +272,8 @@ def follow(
 
         if dr.hint(hide_emitters, mode="scalar"):
             source_active &= bounces > 0
+        if dr.hint(transport.hide_emitters, mode="scalar"):
+            source_active &= valid | si.is_valid()
         if dr.hint(not transport.emission, mode="scalar"):
             source_active &= bounces > 0
         ds = mi.DirectionSample3f(scene, si=source_si, ref=origin)

@@ -54,7 +54,7 @@ def references(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", EXPERIMENTS)
+@pytest.mark.parametrize("name", TINY)
 def test_experiment(name, tmp_path):
     """Each writes what was asked, with all its numbers, and shows them."""
     module = EXPERIMENTS[name]
@@ -101,6 +101,26 @@ def _runs(value):
     if isinstance(value, list):
         for item in value:
             yield from _runs(item)
+
+
+def test_gallery(tmp_path, capsys):
+    """What ``tests/system/test_gallery.py`` doesn't see of it: the files and the table."""
+    assert EXPERIMENTS.keys() - TINY.keys() == {"gallery"}
+    wanted = "a single triangle|no emitters"
+    assert main(["gallery", "--match", wanted, "--out", str(tmp_path)]) == 0
+    shown = capsys.readouterr().out
+    assert "a single triangle" in shown and "the scene has no emitters" in shown
+    document = json.loads((tmp_path / "gallery.json").read_text(), parse_constant=pytest.fail)
+    assert document["numbers"].keys() == {"a single triangle", "no emitters"}
+    for numbers in document["numbers"]["a single triangle"].values():
+        assert numbers["highest"] <= numbers["brightest"]
+        assert abs(numbers["bias"]) <= numbers["allowed"] + numbers["margin"]
+    assert (tmp_path / "gallery-sheet.png").stat().st_size > 1000
+
+
+def test_gallery_without_a_case(capsys, tmp_path):
+    assert main(["gallery", "--match", "no such case", "--out", str(tmp_path)]) == 2
+    assert 'no case is called "no such case"' in capsys.readouterr().err
 
 
 # ---------------------- Known answers ----------------------

@@ -183,9 +183,13 @@ def test_of_a_listed_shape_what_lies_in_another_space_is_left_out(scene):
     assert np.array_equal(cluster_of_point, np.where(member, 0, -1))
 
 
-def test_a_shape_without_surface_is_named(scene):
-    with pytest.raises(ValueError, match='mipmap_cube "desk": no surface was found on "right"'):
-        listed(scene, ClusterRequest("desk", ("right",), None), points=floor())
+def test_a_listed_shape_without_surface_is_left_out(scene):
+    """As are mirrors and glass, which get no points, and what is too small to get any."""
+    clusters, cluster_of_point = listed(
+        scene, ClusterRequest("desk", ("right",), None), points=floor()
+    )
+    assert clusters == []
+    assert (cluster_of_point == -1).all()
 
 
 def test_long_lists_of_shapes_are_cut():

@@ -8,6 +8,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy import stats
 
@@ -157,3 +159,90 @@ def test_rays_end_on_the_surface_at_any_scale(scale, shift):
 def test_rays_from_outside_have_no_exit():
     origins, towards = all_pairs(SPECIAL * (1 + 1e-6), SPECIAL)
     assert (exit_distance((0, 0, 0), 1, origins, towards) < 0).all()
+
+
+# ---------------------- Any cube, any ray ----------------------
+
+#: Rounding of single precision, and how many roundings a result has gone through at most.
+EPSILON, ROUNDINGS = np.finfo(np.float32).eps, 4
+
+
+@st.composite
+def cubes_and_rays(draw):
+    """Cubes, and rays from inside, from faces, edges and corners; zero components included."""
+    half_width = np.float32(draw(st.sampled_from([1e-4, 1e-2, 1.0, 7.3, 1e3, 1e5])))
+    place = draw(st.sampled_from([0.0, 1.0, 100.0, 1e4]))
+    fractions = st.one_of(st.sampled_from([-1.0, 0.0, 1.0]), st.floats(-1, 1))
+    vectors = st.tuples(fractions, fractions, fractions)
+    centre = np.float32(place * half_width * np.array(draw(vectors)))
+    rays = draw(
+        st.lists(
+            st.tuples(vectors, vectors.filter(lambda d: max(map(abs, d)) > 1e-6)),
+            min_size=1,
+            max_size=20,
+        )
+    )
+    within, towards = (np.array(part) for part in zip(*rays, strict=True))
+    origins = np.float32(centre + half_width * within)
+    return centre, half_width, origins, np.float32(towards)
+
+
+def double(*values):
+    return (np.asarray(value, np.float64) for value in values)
+
+
+def rounding_error(centre, half_width) -> np.float64:
+    """Of a coordinate of a cube's surface [world units]."""
+    return ROUNDINGS * EPSILON * (np.abs(centre).max() + half_width)
+
+
+PROPERTIES = settings(max_examples=200, derandomize=True, deadline=None, database=None)
+
+
+@PROPERTIES
+@given(cubes_and_rays())
+def test_exits_are_those_of_double_precision(case):
+    t = exit_distance(*case).astype(np.float64)
+    centre, half_width, origins, towards = double(*case)
+    error = rounding_error(centre, half_width)
+    assert not np.isnan(t).any()
+    depth = half_width - np.abs(origins - centre).max(axis=1)
+    assert (t[depth > error] >= 0).all()
+    assert (t[depth < -error] < 0).all()
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slabs = (centre + np.copysign(half_width, towards) - origins) / towards
+        width = error / np.abs(towards) + ROUNDINGS * EPSILON * np.abs(slabs)
+        low, high = (
+            np.where(towards == 0, np.inf, slabs + sign * width).min(axis=1) for sign in (-1, 1)
+        )
+    inside = t >= 0
+    assert (low[inside] <= t[inside]).all() and (t[inside] <= high[inside]).all()
+
+
+@PROPERTIES
+@given(cubes_and_rays())
+def test_no_ray_slips_through_a_cube(case):
+    """What starts inside ends on the surface, however it is placed."""
+    t = exit_distance(*case).astype(np.float64)
+    centre, half_width, origins, towards = double(*case)
+    error = rounding_error(centre, half_width)
+    inside = np.abs(origins - centre).max(axis=1) <= half_width - error
+    t, origins, towards = t[inside], origins[inside], towards[inside]
+    assert np.isfinite(t).all() and (t > 0).all()
+    end = np.abs(origins + t[:, None] * towards - centre)
+    # Twice: the error of t, and that of the end it leads to.
+    assert (np.abs(end.max(axis=1) - half_width) <= 2 * error).all()
+
+
+@PROPERTIES
+@given(cubes_and_rays())
+def test_faces_are_those_of_double_precision(case):
+    *_, towards = case
+    face, uv = cube.direction_to_face(vector(towards))
+    (d,) = double(towards)
+    rows, axis = np.arange(len(d)), face.numpy() // 2
+    major = d[rows, axis]
+    assert (np.abs(major) == np.abs(d).max(axis=1)).all()
+    assert np.array_equal(face.numpy() % 2 == 1, major < 0)
+    expected = np.stack([d[rows, (axis + k) % 3] for k in (1, 2)]) / np.abs(major)
+    assert_allclose(uv.numpy(), expected, rtol=ROUNDINGS * EPSILON, atol=1e-37)
