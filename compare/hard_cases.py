@@ -372,7 +372,7 @@ CUBES = {
         lambda: small_room(lamp=lamp(x=-0.5, y=0.6, z=-1.5 + HALF_WIDTH, half_width=0.2, power=50)),
         enclosed(50, 0.7),
         maps=BLOCK_CUBE,
-        spp=64,
+        spp=256,
         precision=0.04,
     ),
     "a lamp beyond a cube": Case(small_room, ROOM, maps=BLOCK_CUBE),

@@ -116,7 +116,9 @@ def artefacts(request):
     for name, picture in pictures.items():
         for suffix in ("exr", "png"):
             path = ARTEFACTS / f"{test}-{name}.{suffix}"
-            mi.util.write_bitmap(str(path), mi.TensorXf(np.asarray(picture, np.float32)))
+            # Mitsuba waits for ever for the second of two files that are written in the background.
+            bitmap = mi.TensorXf(np.asarray(picture, np.float32))
+            mi.util.write_bitmap(str(path), bitmap, write_async=False)
 
 
 # ---------------------- Third-party scenes ----------------------

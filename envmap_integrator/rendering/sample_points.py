@@ -5,7 +5,9 @@ spread in each pair of dimensions pay. They are those of a (0,2)-sequence (Sobol
 for each pair of dimensions: shuffled and scrambled by Owen's method with hashes (Laine and Karras
 2011; Burley 2020), for any number of samples. Neighbouring pixels, which share SIMD registers, take
 the same strata in the same order, so that their rays go about the same way, hit the same surfaces
-and end together; within the strata, each pixel has its own points.
+and end together; within the strata, each pixel has its own points. There are as many strata as the
+largest power of two that divides the number of samples: each pixel has equally many samples in each
+of them, so that the errors of neighbours have nothing in common.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ class SamplePoints:
 
     pattern    [N]  hash of the seed and the group of lanes
     own        [N]  hash of the seed and the lane
-    strata     []   base-2 logarithm of the number of samples, rounded down
+    strata     []   base-2 logarithm of the number of strata that a group of lanes shares
     index      [N]  of the sample
     dimension  [N]  how many numbers and pairs of numbers of the sample have been drawn
     """
@@ -48,7 +50,7 @@ class SamplePoints:
         return cls(
             pattern=mix(seed ^ (lane // LANES_ALIKE) * _BY_LANE),
             own=mix(~seed ^ lane * _BY_LANE),
-            strata=dr.opaque(mi.UInt32, count.bit_length() - 1),
+            strata=dr.opaque(mi.UInt32, (count & -count).bit_length() - 1),
             index=mi.UInt32(first),
             dimension=mi.UInt32(0),
         )
@@ -76,8 +78,11 @@ class SamplePoints:
     def _next(self) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
         """Index in the sequence of a new dimension, its hash for a group of lanes and for one."""
         step = self.dimension * _BY_DIMENSION
+        # The first is the place in the pixel, and all that follows depends on what is seen there:
+        # did the strata of both meet alike in all lanes, these would share part of their errors.
+        pattern = dr.select(self.dimension == 0, self.own ^ _SECOND, self.pattern)
+        scramble = mix(pattern + step)
         self.dimension = self.dimension + 1
-        scramble = mix(self.pattern + step)
         return dr.brev(_scrambled(dr.brev(self.index), scramble)), scramble, mix(self.own + step)
 
 

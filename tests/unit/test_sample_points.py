@@ -49,11 +49,21 @@ def test_neighbours_share_strata_and_no_more():
     strata = np.floor(points * 8)
     first = strata[:, :, :1]
     alike, others = strata[:, :, :LANES_ALIKE], strata[:, :, LANES_ALIKE:]
-    assert (alike == first).all()
+    assert (alike[1:] == first[1:]).all()
     # Of two numbers that have nothing to do with each other, one in 8 is in the same stratum.
     assert (others == first).mean() == pytest.approx(1 / 8, abs=0.03)
+    # The place in the pixel has no part in it.
+    assert (alike[0, :, 1:] == first[0]).mean() == pytest.approx(1 / 8, abs=0.03)
     within = points * 8 - strata
     assert len(np.unique(within[0, 0, :LANES_ALIKE, 0])) == LANES_ALIKE
+
+
+def test_strata_are_shared_that_all_pixels_fill_equally():
+    points = draw(48, lanes=LANES_ALIKE)[1:]
+    strata = np.floor(points * 4)
+    assert (strata == strata[:, :, :1]).all()
+    cell = np.sort(4 * strata[..., 0] + strata[..., 1], axis=1)
+    assert (cell == np.repeat(np.arange(16), 3)[:, None]).all()
 
 
 @pytest.mark.parametrize("count", [1, 37, 64])
@@ -74,13 +84,23 @@ def test_dimensions_and_samples_are_independent():
     assert np.abs(correlation).max() < 5 / np.sqrt(numbers.shape[1])
 
 
-def test_errors_of_neighbours_are_independent():
+@pytest.mark.parametrize("count", [1, 12, 16, 37])
+def test_errors_of_neighbours_are_independent(count):
     """Else to share light between pixels would take no noise away."""
-    points = draw(16, lanes=LANES_ALIKE * 2048)[0]
+    points = draw(count, lanes=LANES_ALIKE * 2048)[1]
     value = np.exp(points[..., 0] + points[..., 1] ** 2) * (points[..., 0] > 0.3)
     mean = value.mean(axis=0).reshape(-1, LANES_ALIKE)
     alone, together = mean.var(), mean.mean(axis=1).var()
     # Of a variance estimated from n values, the standard error is about sqrt(2 / n).
+    assert together == pytest.approx(alone / LANES_ALIKE, rel=4 * np.sqrt(2 / len(mean)))
+
+
+def test_errors_of_neighbours_are_independent_for_edges_in_a_pixel():
+    """What is seen at one place of it sends other light than what is seen at the next."""
+    place, direction = draw(16, lanes=LANES_ALIKE * 2048)[:2]
+    value = (place[..., 0] > 0.6) * (direction.sum(axis=-1) > 1.2)
+    mean = value.mean(axis=0).reshape(-1, LANES_ALIKE)
+    alone, together = mean.var(), mean.mean(axis=1).var()
     assert together == pytest.approx(alone / LANES_ALIKE, rel=4 * np.sqrt(2 / len(mean)))
 
 
