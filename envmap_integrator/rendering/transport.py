@@ -28,6 +28,7 @@ from ..radiosity.irradiance import IrradianceCache
 from ..radiosity.patches import Patches
 from ..radiosity.surface_points import ObjectIds
 from .ray_counts import Ray, count, count_secondary
+from .sample_points import LANES_ALIKE
 from .source_choice import SourceChoice
 
 #: Directions sampled more densely than this [1/sr] belong to a lobe for which a Lambertian
@@ -41,10 +42,6 @@ LOBE_CHOICES = 4
 #: it may end one that has lost no light: a path in glass that is reflected on and on would come out
 #: a firefly if it had to survive one chance in twenty of its end at each bounce.
 RR_DEPTH, LOSSLESS_RR_DEPTH = 6, 128
-
-
-#: Neighbouring lanes that decide alike whether to estimate a residual: they share SIMD registers.
-LANES_ALIKE = 16
 
 
 @dataclass(frozen=True)
@@ -63,7 +60,7 @@ class Residual:
     seed: mi.UInt32
 
     def decision(self, lane, bounces):
-        """A random number in the unit interval for each bounce of each group of lanes."""
+        """A random number in [0, 1) for each bounce of the lanes that share registers."""
         group = lane // LANES_ALIKE
         return mi.Float(mix(mix(self.seed ^ group * 0x9E3779B1) + bounces) >> 8) / 16777216.0
 
