@@ -19,8 +19,6 @@ from ..scene_order import ordered_shapes
 
 #: Hits followed along each global line, and along each walk from a sensor.
 LINE_HITS, WALK_HITS = 8, 4
-#: Share of the points that come from walks: those of lines are where nobody looks, too.
-WALKED = 2 / 3
 #: Batches of rays cast at most to find about as many points as asked for, what share of them is
 #: enough, and how many times as many rays may be cast as if none were lost.
 MAX_BATCHES, ENOUGH, MAX_RAYS = 4, 0.9, 8
@@ -122,8 +120,8 @@ def scatter_points(
 ) -> SurfacePoints:
     """Spread about ``count`` points over the surfaces of a scene.
 
-    Some come from global lines, uniform in position and direction, which hit all surfaces in
-    proportion to their area (Cauchy-Crofton; Sbert 1993). Most come from walks that start at the
+    Half come from global lines, uniform in position and direction, which hit all surfaces in
+    proportion to their area (Cauchy-Crofton; Sbert 1993). Half come from walks that start at the
     scene's sensors and follow the BSDFs: that is where the renderer will ask. Mirrors and glass
     get points only if ``mirrors`` is set.
     """
@@ -150,9 +148,8 @@ def scatter_points(
 
     points = []
     if sensors:
-        n_walked = round(WALKED * count)
-        points += _enough(walks, n_walked, WALK_HITS * len(sensors))
-        count -= n_walked
+        points += _enough(walks, count // 2, WALK_HITS * len(sensors))
+        count -= count // 2
     return SurfacePoints.concatenate(points + _enough(lines, count, LINE_HITS))
 
 
