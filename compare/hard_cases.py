@@ -441,9 +441,9 @@ LIGHT = {
     ),
     "64 lamps": Case(many_lamps, ROOM),
     "a textured lamp": Case(textured_lamp, ROOM),
-    "light through glass": Case(lambda: behind("thindielectric"), enclosed(1, 0.7)),
+    "light through glass": Case(lambda: behind("thindielectric"), enclosed(1, 0.7), spp=64),
     "light through a mask": Case(
-        lambda: behind("mask", opacity=0.5, inner=grey(0.5)["bsdf"]), enclosed(1, 0.7)
+        lambda: behind("mask", opacity=0.5, inner=grey(0.5)["bsdf"]), enclosed(1, 0.7), spp=64
     ),
     "light through nothing": Case(lambda: behind("null"), enclosed(1, 0.7)),
     "hidden lamps": Case(small_room, ROOM, settings={"hide_emitters": True}),
@@ -455,6 +455,7 @@ LIGHT = {
         ),
         enclosed(1, 0.7),
         settings={"hide_emitters": True},
+        spp=64,
     ),
     "a lamp seen from behind": Case(
         lambda: small_room(sensor=look(origin=(0, 0, 1.98), target=(0, 0.1, 0))), ROOM
