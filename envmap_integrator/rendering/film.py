@@ -16,6 +16,8 @@ from .sample_points import SamplePoints
 #: Lanes of a render at least, where it has as many samples (fewer would leave threads idle), and at
 #: most, which is Dr.Jit's limit.
 MIN_LANES, MAX_LANES = 1 << 20, (1 << 32) - 1
+#: Floats of pixels' records from which on freed memory goes back to the system: that takes a while.
+LARGE = 1 << 24
 
 
 def most_samples(sensor: mi.Sensor) -> int:
@@ -52,7 +54,8 @@ def expose_filtered(sensor, sampler, spp, seed, shade, n_samples: int) -> None:
     # These are the largest arrays of a render: none outlives its use.
     records = pixel_records(Gathered.of_channels(sums[-n_guides:]))
     del sums[-n_guides:]
-    dr.flush_malloc_cache()
+    if dr.width(records) >= LARGE:
+        dr.flush_malloc_cache()
     width = int(sensor.film().crop_size()[0])
     shared = filter_irradiance(records, width, tolerance(n_samples))
     for index, value in enumerate(_rgb(shared)):
