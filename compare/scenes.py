@@ -32,7 +32,7 @@ class View:
     path          scene description, XML
     width         of the film [pixels]; its height follows from the scene's own film
     parameters    values of its ``$name`` place-holders
-    sampler       plugin that draws the sample points
+    sampler       plugin that draws the sample points, unless integrators have their own
     merge_meshes  False keeps shapes apart, so that their ids can be used
     """
 

@@ -43,6 +43,11 @@ def mix(h: mi.UInt32) -> mi.UInt32:
     return h ^ (h >> 16)
 
 
+def unit(bits: mi.UInt32) -> mi.Float:
+    """A number in [0, 1) from the upper bits of a random integer."""
+    return mi.Float(bits >> 8) / 16777216.0
+
+
 class SpareNumbers:
     """Uniform random numbers where quality hardly matters, many from one sample of the sampler.
 
@@ -55,7 +60,7 @@ class SpareNumbers:
 
     def next_1d(self) -> mi.Float:
         self._count += 1
-        return mi.Float(mix(self._bits + self._count * 0x9E3779B1 % 2**32) >> 8) / 16777216.0
+        return unit(mix(self._bits + self._count * 0x9E3779B1 % 2**32))
 
     def next_2d(self) -> mi.Point2f:
         return mi.Point2f(self.next_1d(), self.next_1d())

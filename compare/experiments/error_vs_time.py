@@ -66,7 +66,7 @@ class Options(JudgedOptions):
     )
     integrators: tuple[str, ...] = option("plugins to compare; path takes part", tuple(SUBJECTS))
     denoised: tuple[str, ...] = option("plugins to denoise too", ("path", "envmap_hybrid"))
-    sampler: str = option("plugin that draws all sample points", BEST_SAMPLER)
+    sampler: str = option("plugin that draws the sample points of path", BEST_SAMPLER)
     max_seconds: float = option("sample counts whose picture takes longer are left out", 60.0)
 
 

@@ -146,10 +146,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
             transport = self.transport(scene, prepared, spp)
 
             def shade(sampler, ray, index):
-                return camera_radiance(
-                    scene, transport.of_sample(index), sampler, ray, mi.Bool(True),
-                    self.secondary_samples,
-                )  # fmt: skip
+                return self.radiance(scene, transport.of_sample(index), sampler, ray, True)
 
             if self.irradiance_filter and self.residual_probability == 0:
                 n_samples = spp * self.secondary_samples
@@ -183,20 +180,15 @@ class CachedIntegrator(mi.SamplingIntegrator):
         return sampler, spp
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
-        found = self.radiance(scene, self.prepare(scene), sampler, ray, active)
+        transport = self.transport(scene, self.prepare(scene), sampler.sample_count())
+        found = self.radiance(scene, transport, sampler, ray, active)
         return found.radiance, found.valid, self.aovs(found)
 
     def aovs(self, found: CameraSample) -> list[mi.Float]:
         """Values of ``aov_names``."""
         return []
 
-    def radiance(self, scene, prepared, sampler, ray, active) -> CameraSample:
-        """As ``camera_radiance``, from a prepared state that need hold no more than the cache."""
-        return camera_radiance(
-            scene,
-            self.transport(scene, prepared, sampler.sample_count()),
-            sampler,
-            mi.Ray3f(ray),
-            mi.Bool(active),
-            self.secondary_samples,
-        )
+    def radiance(self, scene, transport, sampler, ray, active) -> CameraSample:
+        """As ``camera_radiance``, with the integrator's own number of secondary rays."""
+        ray, active = mi.Ray3f(ray), mi.Bool(active)
+        return camera_radiance(scene, transport, sampler, ray, active, self.secondary_samples)

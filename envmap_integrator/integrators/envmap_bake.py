@@ -78,9 +78,10 @@ class EnvmapBake(CachedIntegrator):
 
         ``prepared`` needs no more than the irradiance cache.
         """
+        transport = self.transport(scene, prepared, self.samples)
 
         def radiance_distance(sampler, ray, active):
-            found = self.radiance(scene, prepared, sampler, ray, active)
+            found = self.radiance(scene, transport, sampler, ray, active)
             return found.radiance, found.distance
 
         return bake_maps(

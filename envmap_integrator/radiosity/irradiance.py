@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..jit import mix, upload
+from ..jit import mix, unit, upload
 from ..progress import stage
 from .direct_light import finite, sample_irradiance
 from .patch_points import PatchPoints
@@ -171,7 +171,7 @@ def _rotated(x, y, rank, seed) -> mi.Point2f:
     """A point set moved round the unit square, by another shift for every patch."""
     seed_ = dr.opaque(mi.UInt32, seed)
     bits = (mix(mix(2 * rank + axis) ^ seed_) for axis in range(2))
-    shift = mi.Point2f(*(mi.Float(b >> 8) / 16777216.0 for b in bits))
+    shift = mi.Point2f(*map(unit, bits))
     point = mi.Point2f(x, y) + shift
     return point - dr.floor(point)
 

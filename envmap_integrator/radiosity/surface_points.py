@@ -160,8 +160,7 @@ def _enough(trace, count: int, n_hits: int) -> list[SurfacePoints]:
     enough hits. Recording a batch costs more than tracing it, so the second is made to be the last.
     """
     least = max(count // n_hits, 1)
-    points, found, traced = [], 0, 0
-    n_rays = least
+    points, traced, n_rays = [], 0, least
     for batch in range(MAX_BATCHES):
         points += trace(n_rays, batch)
         traced += n_rays

@@ -189,12 +189,8 @@ def gathering(scene, si, bsdf, radiance, nearness, active) -> Gathered:
     albedo += dr.select(single_lobe(bsdf), 0, GLOSS_ALBEDO)
     shared = active & is_diffuse(bsdf) & (dr.max(albedo) > 0)
     centre = opaque_point(scene.bbox().center())
-    return Gathered(
-        *(
-            dr.select(shared, value, 0)
-            for value in (radiance, albedo, si.sh_frame.n, si.p - centre, nearness, mi.Float(1))
-        )
-    )
+    found = Gathered(radiance, albedo, si.sh_frame.n, si.p - centre, nearness, mi.Float(1))
+    return found.where(shared)
 
 
 def secondary(scene, transport, sampler, vertex, u, active):

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..jit import mix
+from ..jit import mix, unit
 
 #: Neighbouring lanes that take the same strata: they share SIMD registers.
 LANES_ALIKE = 16
@@ -64,7 +64,7 @@ class SamplePoints:
         """A number in [0, 1)."""
         shuffled, scramble, own = self._next()
         bits = dr.brev(_scrambled(shuffled, mix(scramble + _SECOND)))
-        return _unit(bits ^ (own >> self.strata))
+        return unit(bits ^ (own >> self.strata))
 
     def next_2d(self, active=True) -> mi.Point2f:
         """A point in the unit square."""
@@ -73,7 +73,7 @@ class SamplePoints:
         x = dr.brev(_scrambled(shuffled, scramble))
         y = dr.brev(_scrambled(_pascal(shuffled), mix(scramble + _SECOND)))
         strata = self.strata >> 1
-        return mi.Point2f(_unit(x ^ (own >> strata)), _unit(y ^ (mix(own + _SECOND) >> strata)))
+        return mi.Point2f(unit(x ^ (own >> strata)), unit(y ^ (mix(own + _SECOND) >> strata)))
 
     def _next(self) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
         """Index in the sequence of a new dimension, its hash for a group of lanes and for one."""
@@ -108,7 +108,3 @@ def _pascal(x: mi.UInt32) -> mi.UInt32:
     x = x ^ (x & 0xCCCCCCCC) >> 2
     x = x ^ (x & 0xAAAAAAAA) >> 1
     return x
-
-
-def _unit(bits: mi.UInt32) -> mi.Float:
-    return mi.Float(bits >> 8) / 16777216.0

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from ..jit import SpareNumbers, mix
+from ..jit import SpareNumbers, mix, unit
 from ..maps.far_field import Cube, FarField
 from ..radiosity.irradiance import IrradianceCache
 from ..radiosity.patches import Patches
@@ -62,7 +62,7 @@ class Residual:
     def decision(self, lane, bounces):
         """A random number in [0, 1) for each bounce of the lanes that share registers."""
         group = lane // LANES_ALIKE
-        return mi.Float(mix(mix(self.seed ^ group * 0x9E3779B1) + bounces) >> 8) / 16777216.0
+        return unit(mix(mix(self.seed ^ group * 0x9E3779B1) + bounces))
 
 
 @dataclass(frozen=True)
