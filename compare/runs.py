@@ -30,10 +30,6 @@ class Task:
     spp: int
     denoise: bool = False
 
-    def shares_preparation(self, other: Task) -> bool:
-        """Do the two differ in samples only?"""
-        return self.scene is other.scene and self.subject == other.subject
-
 
 @dataclass(frozen=True)
 class Run:
@@ -119,9 +115,8 @@ def interleave(
 ) -> list[Measurements]:
     """Let the tasks take turns, ``n_runs`` times: a machine slows all of them or none.
 
-    Run ``i`` of every task has the seed ``seed + i``. Tasks of the same subject and scene that
-    follow each other differ in samples only: they share the preparation of that run, which counts
-    for each of them.
+    Run ``i`` of every task has the seed ``seed + i``. Each run has a preparation of its own, which
+    counts: what is prepared depends on the samples.
     """
     measured = [Measurements(task.subject, task.spp) for task in tasks]
     for task in tasks:
@@ -129,14 +124,10 @@ def interleave(
             warm_up(*task.scene.sensors()[0].film().crop_size())
     with record_kernels(), stage("timed runs", total=len(tasks) * n_runs) as advance:
         for index in range(n_runs):
-            previous = None
             for task, measurements in zip(tasks, measured, strict=True):
-                if previous is None or not task.shares_preparation(previous):
-                    integrator = task.subject.make(hide_emitters)
-                    preparation = _prepare(task.scene, integrator)
-                previous = task
+                integrator = task.subject.make(hide_emitters)
                 measurements.settings = str(integrator)
-                measurements.runs.append(_timed_run(task, integrator, preparation, seed + index))
+                measurements.runs.append(_timed_run(task, integrator, seed + index))
                 advance(1)
     return measured
 
@@ -154,30 +145,16 @@ def equal_time_spp(task: Task, pilot_spp: int, seed: int, hide_emitters: bool = 
     return rows * round(spp / rows)
 
 
-@dataclass(frozen=True)
-class _Preparation:
-    total_s: float
-    stages_s: dict[str, float]
-    compile_s: float
-
-
-def _prepare(scene: mi.Scene, integrator: mi.Integrator) -> _Preparation:
-    """Run the pre-passes, if the integrator has any."""
+def _timed_run(task: Task, integrator: mi.Integrator, seed: int) -> Run:
+    """All that a user waits for, compilation apart."""
     seconds: dict[str, float] = {}
     stages: dict[str, float] = {}
+    denoised = None
     compilation_time()  # what came before isn't ours
     with measure(seconds, "prepare"):
         if hasattr(integrator, "prepare"):
-            stages = dict(integrator.prepare(scene).stage_times)
-    compile_s = compilation_time()
-    return _Preparation(seconds["prepare"] - compile_s, stages, compile_s)
-
-
-def _timed_run(task: Task, integrator: mi.Integrator, preparation: _Preparation, seed: int) -> Run:
-    """All that a user waits for, compilation apart."""
-    seconds: dict[str, float] = {}
-    picture = denoised = None
-    compilation_time()
+            stages = dict(integrator.prepare(task.scene, spp=task.spp).stage_times)
+    prepare_compile_s = compilation_time()
     with measure(seconds, "render"):
         picture = render(task.scene, integrator, task.spp, seed)
     render_compile_s = compilation_time()
@@ -187,11 +164,11 @@ def _timed_run(task: Task, integrator: mi.Integrator, preparation: _Preparation,
     denoise_compile_s = compilation_time()
     return Run(
         seed=seed,
-        prepare_s=preparation.total_s,
-        stages_s=preparation.stages_s,
+        prepare_s=seconds["prepare"] - prepare_compile_s,
+        stages_s=stages,
         render_s=seconds["render"] - render_compile_s,
         denoise_s=seconds["denoise"] - denoise_compile_s if task.denoise else 0.0,
-        compile_s=preparation.compile_s + render_compile_s + denoise_compile_s,
+        compile_s=prepare_compile_s + render_compile_s + denoise_compile_s,
         picture=picture,
         denoised=denoised,
     )

@@ -208,8 +208,9 @@ def variants(patches: int, finer: int) -> dict[str, Variant]:
     """
     own = HYBRID.make()
     # The filter's error isn't that of the method, and hides its noise.
-    shared = {"patches": patches, "irradiance_filter": False}
-    gathered = {"patch_samples": own.patch_samples * finer}
+    samples = own.LEAST_PATCH_SAMPLES
+    shared = {"patches": patches, "patch_samples": samples, "irradiance_filter": False}
+    gathered = {"patch_samples": samples * finer}
     small_patches = {"patches": patches * finer}
     baked = {"baker": {"type": "envmap_bake", "samples": own.baker.samples * finer}}
     small_texels = {"map_resolution": own.map_resolution * math.isqrt(finer)}

@@ -33,7 +33,7 @@ class SceneFingerprint:
             for array, index in zip(arrays, indices, strict=True):
                 if index not in known:  # Shapes share materials and textures.
                     data = np.ascontiguousarray(array.numpy())
-                    known[index] = hashlib.blake2b(data.tobytes(), digest_size=16).digest()
+                    known[index] = hashlib.blake2b(data, digest_size=16).digest()
                 digest.update(known[index])
             # Holding on to the arrays keeps Dr.Jit from giving their indices to others.
             self._arrays, self._indices, self._scalars = arrays, indices, scalars

@@ -8,6 +8,8 @@ import numpy as np
 
 #: Alignment [bytes] of Dr.Jit's own memory.
 _ALIGNMENT = 64
+#: Floats from which on freed memory is handed back.
+_LARGE = 1 << 24
 
 
 def upload(dtype: type, values: np.ndarray) -> mi.Float | mi.UInt32:
@@ -64,3 +66,9 @@ class SpareNumbers:
 
     def next_2d(self) -> mi.Point2f:
         return mi.Point2f(self.next_1d(), self.next_1d())
+
+
+def give_back(n_floats: int) -> None:
+    """Hand freed memory back to the system if it was about so large: that takes a while."""
+    if n_floats >= _LARGE:
+        dr.flush_malloc_cache()

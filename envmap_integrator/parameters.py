@@ -17,15 +17,19 @@ class Parameters:
         self._props = props
         self.owner = f'{props.plugin_name()} "{props.id()}"' if props.id() else props.plugin_name()
 
-    def integer(self, name: str, default: int, low: int, high: int = 2**31 - 1) -> int:
+    def integer(
+        self, name: str, default: int | None, low: int, high: int = 2**31 - 1
+    ) -> int | None:
+        if default is None and name not in self._props:
+            return None
         value = self._props.get(name, default)
         if isinstance(value, bool) or not isinstance(value, int):
             raise TypeError(f'{self.owner}: "{name}" must be an integer, not {value!r}')
         return self._in_range(name, value, low, high)
 
-    def power_of_two(self, name: str, default: int, low: int, high: int) -> int:
+    def power_of_two(self, name: str, default: int | None, low: int, high: int) -> int | None:
         value = self.integer(name, default, low, high)
-        if value & (value - 1):
+        if value is not None and value & (value - 1):
             raise ValueError(f'{self.owner}: "{name}" must be a power of two, not {value}')
         return value
 

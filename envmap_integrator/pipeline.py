@@ -30,6 +30,10 @@ from .rendering.source_choice import Emitters
 from .rendering.transport import Transport
 from .storage import StorageError, Stored, read, write
 
+#: Patches that a render is worth, at least and at most, and camera samples for which there is one.
+LEAST_PATCHES, MOST_PATCHES, SAMPLES_PER_PATCH = 8192, 16384, 1536
+#: Gather rays for each camera sample, about; of a patch at most: all are kept until it's solved.
+GATHER_SHARE, MOST_PATCH_SAMPLES = 1 / 16, 256
 #: Surface points per patch of the budget.
 POINTS_PER_PATCH = 24
 #: Memory [bytes] taken at most by a patch of the budget, by each of its gather rays, and by each of
@@ -39,10 +43,14 @@ PATCH_MEMORY, RAY_MEMORY, TEXEL_MEMORY = 10000, 40, 130
 
 @dataclass(frozen=True)
 class Settings:
-    """What the pre-passes depend on besides the scene; see the integrators for the meanings."""
+    """What the pre-passes depend on besides the scene; see the integrators for the meanings.
 
-    patches: int
-    patch_samples: int
+    ``patches`` and ``patch_samples`` are None until the size of a render decides.
+    """
+
+    patches: int | None
+    patch_samples: int | None
+    least_patch_samples: int
     maps: bool = False
     map_resolution: int = 0
     map_samples: int = 0
@@ -50,6 +58,22 @@ class Settings:
     map_mirrors: bool = False
     map_always: bool = False
     requests: tuple[ClusterRequest, ...] = ()
+
+    def for_render(self, n_samples: int) -> Settings:
+        """With a coarse mesh and a cache as fine as so many camera samples are worth.
+
+        So the pre-passes take a small part of the time of a render, and their error falls with its
+        noise.
+        """
+        patches = self.patches
+        if patches is None:
+            patches = min(max(n_samples // SAMPLES_PER_PATCH, LEAST_PATCHES), MOST_PATCHES)
+        samples = self.patch_samples
+        if samples is None:
+            most = int(GATHER_SHARE * n_samples / patches)
+            samples = max(1 << most.bit_length() >> 1, self.least_patch_samples)
+            samples = min(samples, MOST_PATCH_SAMPLES)
+        return replace(self, patches=patches, patch_samples=samples)
 
 
 @dataclass(frozen=True)
@@ -81,6 +105,7 @@ class Prepared:
 def prepare(scene: mi.Scene, key: str, settings: Settings, owner: str, baker=None) -> Prepared:
     """Run the pre-passes. ``baker`` is the ``envmap_bake`` that fills the maps.
 
+    ``settings`` are those ``for_render``.
     Raises ``ValueError``, in the name of ``owner``, if there is too little memory for the settings.
     """
     check_memory(

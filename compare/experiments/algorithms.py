@@ -165,7 +165,7 @@ def _count(tasks: list[Task], hidden: bool) -> list[Counts]:
     for task in tasks:
         integrator = task.subject.make(hidden)
         with count_rays() as rays:
-            prepared = integrator.prepare(task.scene)
+            prepared = integrator.prepare(task.scene, spp=task.spp)
         preparing.append((rays, prepared))
         with count_rays() as rays:
             picture = render(task.scene, integrator, task.spp, seed=0)

@@ -96,8 +96,8 @@ def _render(
         integrator = variant.subject.make(hidden)
         key = integrator.settings(), variant.prepared_otherwise
         if key not in known:
-            known[key] = integrator.prepare(scene)
-        stack.enter_context(patch.object(integrator, "prepare", lambda _: known[key]))
+            known[key] = integrator.prepare(scene, spp=options.spp)
+        stack.enter_context(patch.object(integrator, "prepare", lambda *_: known[key]))
         seeds = range(options.seed, options.seed + options.runs)
         pictures = [render(scene, integrator, options.spp, seed) for seed in seeds]
         rays = None

@@ -35,7 +35,7 @@ def render(args: argparse.Namespace) -> int:
         if args.denoise:  # Fails before the work starts, if there is no denoiser.
             warm_up(*sensor.film().crop_size())
         if hasattr(scene.integrator(), "prepare"):
-            seconds |= scene.integrator().prepare(scene).stage_times
+            seconds |= scene.integrator().prepare(scene, sensor, args.spp).stage_times
         with measure(seconds, "render"):
             # Not mi.render, which would make another exception of Ctrl-C.
             dr.eval(scene.integrator().render(scene, sensor, seed=args.seed, spp=args.spp))

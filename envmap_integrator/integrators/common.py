@@ -35,7 +35,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
     (``transport``).
     """
 
-    PATCH_SAMPLES = 32
+    LEAST_PATCH_SAMPLES = 32
     """By default; the noise of many patches averages out where secondary rays end in them."""
 
     SHADOW_SAMPLES = 2
@@ -46,10 +46,8 @@ class CachedIntegrator(mi.SamplingIntegrator):
         super().__init__(props)
         parameters = Parameters(props)
         self.owner = parameters.owner
-        self.patches = parameters.integer("patches", 16384, 16, 1 << 22)
-        self.patch_samples = parameters.power_of_two(
-            "patch_samples", self.PATCH_SAMPLES, 1, 1 << 16
-        )
+        self.patches = parameters.integer("patches", None, 16, 1 << 22)
+        self.patch_samples = parameters.power_of_two("patch_samples", None, 1, 1 << 16)
         self.shadow_samples = parameters.integer("shadow_samples", self.SHADOW_SAMPLES, 1, 1 << 16)
         self.secondary_samples = 1
         self.residual_probability = 0.0
@@ -57,7 +55,8 @@ class CachedIntegrator(mi.SamplingIntegrator):
         self.sampler = parameters.choice("sampler", "coherent", SAMPLERS)
         self.cache_file = parameters.text("cache_file")
         self._fingerprint = SceneFingerprint()
-        self._prepared: Prepared | None = None
+        self._key = ""
+        self._prepared: dict[Settings, Prepared] = {}
         self._scene_ids: tuple | None = None
         self._seed = 0
 
@@ -65,7 +64,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
 
     def settings(self, **more) -> Settings:
         """What the pre-passes depend on besides the scene."""
-        return Settings(patches=self.patches, patch_samples=self.patch_samples, **more)
+        return Settings(self.patches, self.patch_samples, self.LEAST_PATCH_SAMPLES, **more)
 
     def transport(self, scene: mi.Scene, prepared: Prepared, spp: int) -> Transport:
         """How paths are followed; ``spp`` samples share a pixel."""
@@ -86,26 +85,32 @@ class CachedIntegrator(mi.SamplingIntegrator):
 
     # ---------------------- Preparation ----------------------
 
-    def prepare(self, scene: mi.Scene) -> Prepared:
-        """Run the pre-passes that scene and settings ask for, unless they have been run.
+    def prepare(self, scene: mi.Scene, sensor: mi.Sensor | int = 0, spp: int = 0) -> Prepared:
+        """Run the pre-passes for a render of a sensor, unless they have been run.
 
-        The result doesn't depend on the view: other sensors reuse it. It's rebuilt when a
-        parameter of a shape, material or emitter of the scene changes.
+        Larger renders get a finer irradiance cache, unless ``patches`` and ``patch_samples`` are
+        set. Those that get the same share the result: it doesn't depend on the view. It's rebuilt
+        when a parameter of a shape, material or emitter of the scene changes.
 
         Raises ``ValueError`` for scenes that can't be rendered and for a ``cache_file`` that is
         missing, damaged, or of another scene or other settings.
         """
-        key = f"{self._fingerprint(scene)} {self.settings()}"
-        if self._prepared is None or self._prepared.key != key:
+        settings = self.settings()
+        key = f"{self._fingerprint(scene)} {settings}"
+        if key != self._key:
             check_scene(scene, self.owner)
-            if self.cache_file:
-                self._prepared = load(self.cache_file, key, self.owner, len(scene.emitters()))
-            else:
-                with interruptible(), dr.suspend_grad():
-                    self._prepared = prepare(
-                        scene, key, self.settings(), self.owner, self.bake_with()
-                    )
-        return self._prepared
+            self._key, self._prepared = key, {}
+        if not self.cache_file:
+            settings = settings.for_render(_camera_samples(scene, sensor, spp))
+        if settings not in self._prepared:
+            self._prepared[settings] = self._make(scene, key, settings)
+        return self._prepared[settings]
+
+    def _make(self, scene: mi.Scene, key: str, settings: Settings) -> Prepared:
+        if self.cache_file:
+            return load(self.cache_file, key, self.owner, len(scene.emitters()))
+        with interruptible(), dr.suspend_grad():
+            return prepare(scene, key, settings, self.owner, self.bake_with())
 
     def transport_from(self, scene: mi.Scene, prepared: Prepared, **more) -> Transport:
         """A ``Transport`` with all that is the same for all integrators."""
@@ -138,7 +143,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
-        prepared = self.prepare(scene)
+        prepared = self.prepare(scene, sensor, spp)
         self._seed = seed
         film = sensor.film()
         with interruptible(), dr.suspend_grad():
@@ -192,3 +197,13 @@ class CachedIntegrator(mi.SamplingIntegrator):
         """As ``camera_radiance``, with the integrator's own number of secondary rays."""
         ray, active = mi.Ray3f(ray), mi.Bool(active)
         return camera_radiance(scene, transport, sampler, ray, active, self.secondary_samples)
+
+
+def _camera_samples(scene: mi.Scene, sensor: mi.Sensor | int, spp: int) -> int:
+    """Number of samples of a render of a sensor; 0 if the scene has none."""
+    if isinstance(sensor, int):
+        if not scene.sensors():
+            return 0
+        sensor = scene.sensors()[sensor]
+    width, height = (int(n) for n in sensor.film().crop_size())
+    return width * height * (spp or sensor.sampler().sample_count())

@@ -30,11 +30,12 @@ class EnvmapBake(CachedIntegrator):
        - Rays per texel, a power of two. (Default: 8)
      * - patches
        - |int|
-       - Budget of patches of the coarse mesh, 16 … 4194304; unused when nested. (Default:
-         16384)
+       - Budget of patches of the coarse mesh, 16 … 4194304; unused when nested. (Default: by the
+         number of camera samples, 8192 … 16384)
      * - patch_samples
        - |int|
-       - Gather rays and shadow rays per patch, a power of two; unused when nested. (Default: 32)
+       - Gather rays and shadow rays per patch, a power of two; unused when nested. (Default: by the
+         number of camera samples, 32 … 256)
      * - shadow_samples
        - |int|
        - Shadow rays where a bake ray hits. (Default: 1)

@@ -19,10 +19,12 @@ class OneLevelPath(CachedIntegrator):
 
      * - patches
        - |int|
-       - Budget of patches of the coarse mesh, 16 … 4194304. (Default: 16384)
+       - Budget of patches of the coarse mesh, 16 … 4194304. (Default: by the number of camera
+         samples, 8192 … 16384)
      * - patch_samples
        - |int|
-       - Gather rays and shadow rays per patch, a power of two. (Default: 32)
+       - Gather rays and shadow rays per patch, a power of two. (Default: by the number of camera
+         samples, 32 … 256)
      * - shadow_samples
        - |int|
        - Shadow rays at a camera hit. (Default: 2)

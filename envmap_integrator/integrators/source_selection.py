@@ -16,10 +16,12 @@ class SourceSelection(CachedIntegrator):
 
      * - patches
        - |int|
-       - Budget of patches of the coarse mesh, 16 … 4194304. (Default: 16384)
+       - Budget of patches of the coarse mesh, 16 … 4194304. (Default: by the number of camera
+         samples, 8192 … 16384)
      * - patch_samples
        - |int|
-       - Gather rays and shadow rays per patch, a power of two. (Default: 128)
+       - Gather rays and shadow rays per patch, a power of two. (Default: by the number of camera
+         samples, 128 … 256)
      * - shadow_samples
        - |int|
        - Shadow rays at a camera hit. (Default: 2)
@@ -36,7 +38,7 @@ class SourceSelection(CachedIntegrator):
        - Hide directly visible emitters. (Default: false)
     """
 
-    PATCH_SAMPLES = 128
+    LEAST_PATCH_SAMPLES = 128
     """The cache is looked at directly, and its noise with it."""
 
     def transport(self, scene, prepared, spp):

@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..jit import mix, unit, upload
+from ..jit import give_back, mix, unit, upload
 from ..progress import stage
 from .direct_light import finite, sample_irradiance
 from .patch_points import PatchPoints
@@ -33,6 +33,8 @@ CHECK_EVERY = 4
 R2 = (0.7548776662466927, 0.5698402909980532)
 #: Gather rays per kernel launch: bounds memory.
 MAX_LANES = 1 << 22
+#: Floats that gather rays leave, and the iteration for them.
+FLOATS_PER_RAY = 12
 
 
 @dataclass(frozen=True)
@@ -95,6 +97,9 @@ def solve_irradiance(
     share = escaped_square / dr.maximum(escaped_square + patched_square, 1e-30)
     escaped_share = np.zeros(transport.patches.count)
     escaped_share[members.patches] = share.numpy()
+    n_rays = dr.width(row)
+    del parts, weight, row
+    give_back(FLOATS_PER_RAY * n_rays)
     return cache, escaped_share
 
 

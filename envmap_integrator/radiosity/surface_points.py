@@ -22,6 +22,8 @@ LINE_HITS, WALK_HITS = 8, 4
 #: Batches of rays cast at most to find about as many points as asked for, what share of them is
 #: enough, and how many times as many rays may be cast as if none were lost.
 MAX_BATCHES, ENOUGH, MAX_RAYS = 4, 0.9, 8
+#: Points from which the extent of all is told.
+EXTENT_POINTS = 1 << 14
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,8 @@ class SurfacePoints:
         """Diagonal of the box that holds most points."""
         if len(self) == 0:
             return 1.0
-        low, high = np.percentile(np.ascontiguousarray(self.position.T), [2, 98], axis=1)
+        some = self.position[:: max(len(self) // EXTENT_POINTS, 1)]
+        low, high = np.percentile(some, [2, 98], axis=0)
         return max(float(np.linalg.norm(high - low)), 1e-30)
 
     def interaction(self, index: mi.UInt32) -> mi.SurfaceInteraction3f:

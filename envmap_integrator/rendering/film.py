@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..interrupt import going_on
+from ..jit import give_back
 from ..progress import stage
 from .irradiance_filter import Gathered, filter_irradiance, pixel_records, tolerance
 from .pixel_filter import PixelFilter
@@ -16,8 +17,6 @@ from .sample_points import SamplePoints
 #: Lanes of a render at least, where it has as many samples (fewer would leave threads idle), and at
 #: most, which is Dr.Jit's limit.
 MIN_LANES, MAX_LANES = 1 << 20, (1 << 32) - 1
-#: Floats of pixels' records from which on freed memory goes back to the system: that takes a while.
-LARGE = 1 << 24
 
 
 def most_samples(sensor: mi.Sensor) -> int:
@@ -54,8 +53,7 @@ def expose_filtered(sensor, sampler, spp, seed, shade, n_samples: int) -> None:
     # These are the largest arrays of a render: none outlives its use.
     records = pixel_records(Gathered.of_channels(sums[-n_guides:]))
     del sums[-n_guides:]
-    if dr.width(records) >= LARGE:
-        dr.flush_malloc_cache()
+    give_back(dr.width(records))
     width = int(sensor.film().crop_size()[0])
     shared = filter_irradiance(records, width, tolerance(n_samples))
     for index, value in enumerate(_rgb(shared)):

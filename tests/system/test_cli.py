@@ -177,7 +177,7 @@ def preparing_integrator():
     mi.set_variant("llvm_ad_rgb")
 
     class Preparing(mi.SamplingIntegrator):
-        def prepare(self, scene):
+        def prepare(self, scene, sensor=0, spp=0):
             return SimpleNamespace(
                 stage_times={"radiosity": 1.25}, save=lambda path: path.write_text("baked")
             )

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from envmap_integrator.pipeline import Settings
 from envmap_integrator.radiosity import irradiance
 from tests.helpers import ROOT, camera, cluster, integrator, load, picture, room
 
@@ -47,6 +48,41 @@ def test_other_views_and_seeds_rebuild_nothing(scene, name):
 
 def test_the_same_seed_gives_the_same_picture(scene, hybrid):
     assert np.array_equal(picture(scene, hybrid, seed=3), picture(scene, hybrid, seed=3))
+
+
+def test_a_picture_does_not_depend_on_what_was_prepared_before(scene):
+    """Larger renders have a finer cache; smaller ones after them don't, or they'd differ."""
+    renderer = mi.load_dict({"type": "one_level_path"})
+    before = picture(scene, renderer, spp=4)
+    coarse = renderer.prepare(scene, spp=4)
+    fine = renderer.prepare(scene, spp=1 << 20)
+    assert dr.width(fine.cache.table) > dr.width(coarse.cache.table)
+    assert renderer.prepare(scene, spp=1 << 20) is fine
+    assert renderer.prepare(scene, scene.sensors()[1], spp=4) is coarse
+    assert np.array_equal(picture(scene, renderer, spp=4), before)
+
+
+def test_what_is_set_holds_for_renders_of_any_size(scene):
+    renderer = integrator("one_level_path", patches=1024, patch_samples=16)
+    assert renderer.prepare(scene, spp=1 << 20) is renderer.prepare(scene, spp=1)
+
+
+@pytest.mark.parametrize(
+    ("n_samples", "patches", "patch_samples"),
+    [
+        (0, 8192, 32),  # no sensor
+        (512 * 512, 8192, 32),
+        (16 * 512 * 512, 8192, 32),
+        (64 * 512 * 512, 10922, 64),
+        (256 * 512 * 512, 16384, 256),
+        (1024 * 1920 * 1080, 16384, 256),
+    ],
+)
+def test_the_preparation_that_renders_are_worth(n_samples, patches, patch_samples):
+    settings = Settings(None, None, 32).for_render(n_samples)
+    assert (settings.patches, settings.patch_samples) == (patches, patch_samples)
+    assert Settings(512, None, 128).for_render(n_samples).patches == 512
+    assert Settings(None, 8, 128).for_render(n_samples).patch_samples == 8
 
 
 @pytest.mark.parametrize(
