@@ -126,6 +126,8 @@ def interleave(
         for index in range(n_runs):
             for task, measurements in zip(tasks, measured, strict=True):
                 integrator = task.subject.make(hide_emitters)
+                if task.denoise and hasattr(integrator, "indirect_aovs"):
+                    integrator.indirect_aovs = True
                 measurements.settings = str(integrator)
                 measurements.runs.append(_timed_run(task, integrator, seed + index))
                 advance(1)
@@ -156,11 +158,12 @@ def _timed_run(task: Task, integrator: mi.Integrator, seed: int) -> Run:
             stages = dict(integrator.prepare(task.scene, spp=task.spp).stage_times)
     prepare_compile_s = compilation_time()
     with measure(seconds, "render"):
-        picture = render(task.scene, integrator, task.spp, seed)
+        channels = _channels(task.scene, integrator, task.spp, seed)
     render_compile_s = compilation_time()
     with measure(seconds, "denoise"):
         if task.denoise:
-            denoised = denoise(task.scene, picture, task.spp, seed)
+            indirect_aovs = getattr(integrator, "indirect_aovs", False)
+            denoised = denoise(task.scene, channels, task.spp, seed, indirect_aovs=indirect_aovs)
     denoise_compile_s = compilation_time()
     return Run(
         seed=seed,
@@ -169,11 +172,16 @@ def _timed_run(task: Task, integrator: mi.Integrator, seed: int) -> Run:
         render_s=seconds["render"] - render_compile_s,
         denoise_s=seconds["denoise"] - denoise_compile_s if task.denoise else 0.0,
         compile_s=prepare_compile_s + render_compile_s + denoise_compile_s,
-        picture=picture,
+        picture=channels[:, :, :3].copy(),
         denoised=denoised,
     )
 
 
 def render(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int) -> Picture:
     """Radiance, [H, W, 3]."""
-    return np.array(mi.render(scene, integrator=integrator, spp=spp, seed=seed))[:, :, :3]
+    return _channels(scene, integrator, spp, seed)[:, :, :3]
+
+
+def _channels(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int) -> np.ndarray:
+    """Radiance, then whatever else the integrator gives, [H, W, C]."""
+    return np.array(mi.render(scene, integrator=integrator, spp=spp, seed=seed))

@@ -10,9 +10,18 @@ GUIDE_SPP = 16
 
 
 def denoise(
-    scene: mi.Scene, picture: np.ndarray, spp: int, seed: int, sensor: int = 0
+    scene: mi.Scene,
+    picture: np.ndarray,
+    spp: int,
+    seed: int,
+    sensor: int = 0,
+    indirect_aovs: bool = False,
 ) -> np.ndarray:
     """The denoised picture of a sensor, [H, W, 3]; the guides are rendered here.
+
+    The first three channels of ``picture`` are its colours. With ``indirect_aovs`` the last nine
+    are those of our integrators' parameter of that name. Then direct light and irradiance, which is
+    free of textures, are denoised apart: each has noise and edges of its own.
 
     The sensor's film is left with the guides. Raises ``ImportError`` if the optional package
     mitsuba-oidn is missing.
@@ -20,7 +29,16 @@ def denoise(
     guide = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"})
     rendered = mi.render(scene, integrator=guide, sensor=sensor, spp=min(spp, GUIDE_SPP), seed=seed)
     channels = np.array(rendered, dtype=np.float32)
-    return _filter(picture, np.clip(channels[:, :, -6:-3], 0, 1), channels[:, :, -3:])
+    albedo, normal = np.clip(channels[:, :, -6:-3], 0, 1), channels[:, :, -3:]
+    colour = picture[:, :, :3]
+    if not indirect_aovs:
+        return _filter(colour, albedo, normal)
+    indirect, gathered, reflectance = np.split(picture[:, :, -9:], 3, axis=2)
+    lit = reflectance > 0
+    irradiance = np.where(lit, gathered / np.where(lit, reflectance, 1), 0)
+    irradiance = _filter(irradiance, np.ones_like(albedo), normal)
+    gathered = np.where(lit, reflectance * irradiance, gathered)
+    return _filter(colour - indirect, albedo, normal) + gathered
 
 
 def warm_up(width: int, height: int) -> None:

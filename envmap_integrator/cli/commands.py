@@ -32,17 +32,23 @@ def render(args: argparse.Namespace) -> int:
         scene_file, scene = _load(args, seconds)
         sensor = _sensor(scene, args.sensor)
         settings = _settings(args, scene_file, scene, sensor)
+        integrator = scene.integrator()
+        for_denoiser = args.denoise and getattr(integrator, "indirect_aovs", None) is False
+        if for_denoiser:
+            integrator.indirect_aovs = True
         if args.denoise:  # Fails before the work starts, if there is no denoiser.
             warm_up(*sensor.film().crop_size())
-        if hasattr(scene.integrator(), "prepare"):
-            seconds |= scene.integrator().prepare(scene, sensor, args.spp).stage_times
+        if hasattr(integrator, "prepare"):
+            seconds |= integrator.prepare(scene, sensor, args.spp).stage_times
         with measure(seconds, "render"):
             # Not mi.render, which would make another exception of Ctrl-C.
-            dr.eval(scene.integrator().render(scene, sensor, seed=args.seed, spp=args.spp))
+            dr.eval(integrator.render(scene, sensor, seed=args.seed, spp=args.spp))
         bitmap = sensor.film().bitmap()
         if args.denoise:
             with measure(seconds, "denoise"):
                 _denoise(bitmap, scene, settings)
+        if for_denoiser:
+            _, bitmap = bitmap.split()[0]
         compilation = compilation_time()
 
     metadata = bitmap.metadata()
@@ -60,13 +66,15 @@ def render(args: argparse.Namespace) -> int:
 def _denoise(bitmap: mi.Bitmap, scene: mi.Scene, settings: dict[str, object]) -> None:
     """Denoise the radiance channels of ``bitmap`` in place."""
     pixels = np.array(bitmap, copy=False)
+    _, radiance = bitmap.split()[0]
     _require(
-        pixels.ndim == 3 and pixels.shape[2] >= 3,
-        f"--denoise needs colour, the film has {pixels[0, 0].size} channel(s): set its "
+        radiance.channel_count() >= 3,
+        f"--denoise needs colour, the film has {radiance.channel_count()} channel(s): set its "
         '"pixel_format" to rgb or rgba',
     )
     spp, seed, sensor = (settings[key] for key in ("spp", "seed", "sensor"))
-    pixels[:, :, :3] = denoise(scene, pixels[:, :, :3], spp, seed, sensor)
+    indirect_aovs = getattr(scene.integrator(), "indirect_aovs", False)
+    pixels[:, :, :3] = denoise(scene, pixels, spp, seed, sensor, indirect_aovs)
 
 
 def bake(args: argparse.Namespace) -> int:

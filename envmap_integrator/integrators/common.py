@@ -12,7 +12,7 @@ from ..parameters import Parameters
 from ..pipeline import Prepared, Settings, load, prepare
 from ..radiosity.surface_points import ObjectIds
 from ..rendering.camera import CameraSample, camera_radiance
-from ..rendering.film import expose, expose_filtered, most_samples
+from ..rendering.film import INDIRECT_AOVS, expose, expose_gathered, most_samples, rgb
 from ..rendering.source_choice import Emitters, SourceChoice
 from ..rendering.transport import Residual, Transport
 
@@ -52,6 +52,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
         self.secondary_samples = 1
         self.residual_probability = 0.0
         self.irradiance_filter = False
+        self.indirect_aovs = False
         self.sampler = parameters.choice("sampler", "coherent", SAMPLERS)
         self.cache_file = parameters.text("cache_file")
         self._fingerprint = SceneFingerprint()
@@ -153,9 +154,10 @@ class CachedIntegrator(mi.SamplingIntegrator):
             def shade(sampler, ray, index):
                 return self.radiance(scene, transport.of_sample(index), sampler, ray, True)
 
-            if self.irradiance_filter and self.residual_probability == 0:
-                n_samples = spp * self.secondary_samples
-                expose_filtered(sensor, sampler, spp, seed, shade, n_samples)
+            shared = self.irradiance_filter and self.residual_probability == 0
+            if shared or self.indirect_aovs:
+                n_shared = spp * self.secondary_samples if shared else 0
+                expose_gathered(sensor, sampler, spp, seed, shade, n_shared, self.indirect_aovs)
             else:
                 expose(sensor, sampler, spp, seed, shade, self.aov_names(), self.aovs)
             picture = film.develop() if develop else mi.TensorXf()
@@ -189,9 +191,15 @@ class CachedIntegrator(mi.SamplingIntegrator):
         found = self.radiance(scene, transport, sampler, ray, active)
         return found.radiance, found.valid, self.aovs(found)
 
+    def aov_names(self) -> list[str]:
+        return list(INDIRECT_AOVS) if self.indirect_aovs else []
+
     def aovs(self, found: CameraSample) -> list[mi.Float]:
         """Values of ``aov_names``."""
-        return []
+        if not self.indirect_aovs:
+            return []
+        gathered = found.gathered
+        return [c for x in (gathered.radiance, gathered.radiance, gathered.albedo) for c in rgb(x)]
 
     def radiance(self, scene, transport, sampler, ray, active) -> CameraSample:
         """As ``camera_radiance``, with the integrator's own number of secondary rays."""

@@ -81,6 +81,11 @@ class EnvmapHybrid(CachedIntegrator):
        - |bool|
        - Let neighbouring pixels share the indirect light that diffuse surfaces gather, where it
          can't differ by much. Off where ``residual_probability`` is above 0. (Default: true)
+     * - indirect_aovs
+       - |bool|
+       - Also give the indirect light that diffuse surfaces gather, as AOVs: ``indirect`` as in the
+         picture, ``gathered`` before pixels share it, and ``albedo``, what it's in proportion to.
+         The denoiser takes it apart from direct light. (Default: false)
      * - sampler
        - |string|
        - Sample points: ``coherent`` ones of our own, stratified in each pixel and much alike in
@@ -120,6 +125,7 @@ class EnvmapHybrid(CachedIntegrator):
         self.secondary_samples = parameters.integer("secondary_samples", 1, 1, 1 << 16)
         self.residual_probability = parameters.number("residual_probability", 0.0, 0.0, 1.0)
         self.irradiance_filter = parameters.flag("irradiance_filter", True)
+        self.indirect_aovs = parameters.flag("indirect_aovs", False)
         self.gather_depth = parameters.integer("gather_depth", 1, 1, 64)
         self.second_hit = parameters.choice("second_hit", "cache", ("cache", "shadow_rays"))
         self.lookup = parameters.choice("lookup", "corrected", ("corrected", "plain"))

@@ -14,6 +14,9 @@ from .irradiance_filter import Gathered, filter_irradiance, pixel_records, toler
 from .pixel_filter import PixelFilter
 from .sample_points import SamplePoints
 
+#: What surfaces gather, as AOVs: as in the picture, before pixels share it, and what it's in
+#: proportion to.
+INDIRECT_AOVS = tuple(f"{name}.{c}" for name in ("indirect", "gathered", "albedo") for c in "RGB")
 #: Lanes of a render at least, where it has as many samples (fewer would leave threads idle), and at
 #: most, which is Dr.Jit's limit.
 MIN_LANES, MAX_LANES = 1 << 20, (1 << 32) - 1
@@ -40,8 +43,11 @@ def expose(sensor, sampler, spp, seed, shade, names: list[str], aovs) -> None:
     _put(sensor, _accumulate(sensor, sampler, spp, seed, shade, channels, len(names)))
 
 
-def expose_filtered(sensor, sampler, spp, seed, shade, n_samples: int) -> None:
-    """As ``expose``; pixels share what they gather with ``n_samples`` rays each."""
+def expose_gathered(sensor, sampler, spp, seed, shade, n_shared: int, with_aovs: bool) -> None:
+    """As ``expose``, with what surfaces gather taken apart and, if asked for, ``INDIRECT_AOVS``.
+
+    Pixels share what they gather with ``n_shared`` rays each, unless that is 0.
+    """
 
     def channels(found, weight):
         apart = found.radiance - found.gathered.radiance
@@ -50,15 +56,22 @@ def expose_filtered(sensor, sampler, spp, seed, shade, n_samples: int) -> None:
 
     n_guides = Gathered.count()
     sums = _accumulate(sensor, sampler, spp, seed, shade, channels, n_guides)
-    # These are the largest arrays of a render: none outlives its use.
-    records = pixel_records(Gathered.of_channels(sums[-n_guides:]))
+    gathered = Gathered.of_channels(sums[-n_guides:])
     del sums[-n_guides:]
-    give_back(dr.width(records))
-    width = int(sensor.film().crop_size()[0])
-    shared = filter_irradiance(records, width, tolerance(n_samples))
-    for index, value in enumerate(_rgb(shared)):
+    indirect = gathered.radiance
+    aovs = [*rgb(gathered.radiance), *rgb(gathered.albedo)] if with_aovs else []
+    if n_shared:
+        # These are the largest arrays of a render: none outlives its use.
+        records = pixel_records(gathered)
+        del gathered, indirect
+        give_back(dr.width(records))
+        width = int(sensor.film().crop_size()[0])
+        indirect = filter_irradiance(records, width, tolerance(n_shared))
+    for index, value in enumerate(rgb(indirect)):
         sums[index] += value
-    sensor.film().prepare([])
+    if with_aovs:
+        sums += [*rgb(indirect), *aovs]
+    sensor.film().prepare(INDIRECT_AOVS if with_aovs else [])
     _put(sensor, sums)
 
 
@@ -170,8 +183,9 @@ def _shown(film: mi.Film, radiance, valid, weight) -> list[mi.Float]:
     """What every film holds: colour, alpha if wanted, and the weight of a sample."""
     wanted = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
     alpha = [dr.select(valid, weight, 0)] if wanted else []
-    return [*_rgb(radiance), *alpha, weight]
+    return [*rgb(radiance), *alpha, weight]
 
 
-def _rgb(radiance: mi.Spectrum) -> tuple[mi.Float, mi.Float, mi.Float]:
+def rgb(radiance: mi.Spectrum) -> tuple[mi.Float, mi.Float, mi.Float]:
+    """What films hold of a colour."""
     return tuple(radiance) if len(radiance) == 3 else (radiance[0],) * 3

@@ -153,3 +153,41 @@ def test_too_many_samples_for_a_sampler_of_mitsuba(variant, monkeypatch):
 
 def test_one_pixel(variant):
     assert picture(load(room(sensor=camera(1, 1))), mi.load_dict({"type": "envmap_hybrid"})).any()
+
+
+# ---------------------- AOVs ----------------------
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("shared", [True, False])
+def test_indirect_light_as_aovs(tiled, kind, shared):
+    """The picture is the same; what is gathered is in it, in proportion to the albedo."""
+    plain, apart = (
+        mi.load_dict({"type": kind, "irradiance_filter": shared, "indirect_aovs": on})
+        for on in (False, True)
+    )
+    channels = np.array(mi.render(tiled, integrator=apart, spp=16))
+    np.testing.assert_array_equal(channels[..., :3], picture(tiled, plain, 16))
+    fields = tiled.sensors()[0].film().bitmap().struct_()
+    assert [field.name for field in fields][-9:] == apart.aov_names()
+    indirect, gathered, albedo = np.split(channels[..., -9:], 3, axis=2)
+    assert np.array_equal(indirect, gathered) != shared
+    assert indirect.mean() == pytest.approx(gathered.mean(), rel=0.02)
+    direct = channels[..., :3] - indirect
+    assert (direct >= -1e-5 * channels[..., :3].max()).all() and direct.max() > indirect.max()
+    tiles = np.array([0.1, 0.2, 0.6]), np.array([0.7, 0.5, 0.3])
+    on_wall = [np.isclose(albedo, tile, atol=1e-3).all(axis=2) for tile in tiles]
+    assert all(wall.sum() > 500 for wall in on_wall)
+    a, b = ((indirect[wall] / albedo[wall]).mean() for wall in on_wall)
+    assert a == pytest.approx(b, rel=0.1)  # the light on both is much the same
+
+
+def test_other_integrators_pass_the_aovs_on(tiled):
+    """``aov`` asks for samples, not for pictures: nothing is shared."""
+    nested = {"type": "one_level_path", "indirect_aovs": True}
+    outer = mi.load_dict({"type": "aov", "aovs": "depth:depth", "img": nested})
+    channels = np.array(mi.render(tiled, integrator=outer, spp=16))
+    indirect, gathered, _ = np.split(channels[..., -10:-1], 3, axis=2)
+    np.testing.assert_array_equal(indirect, gathered)
+    ours = np.array(mi.render(tiled, integrator=mi.load_dict(nested), spp=16))[..., -6:-3]
+    assert gathered.mean() == pytest.approx(ours.mean(), rel=0.02)
