@@ -44,9 +44,13 @@ class SamplePoints:
     dimension: mi.UInt32
 
     @classmethod
-    def of(cls, seed: int, lane: mi.UInt32, count: int, first: mi.UInt32) -> SamplePoints:
+    def of(
+        cls, seed: int | mi.UInt32, lane: mi.UInt32, count: int, first: mi.UInt32
+    ) -> SamplePoints:
         """Points of ``count`` samples for each lane, from the ``first`` on."""
-        seed = mix(dr.opaque(mi.UInt32, seed & 0xFFFFFFFF) + _SECOND)
+        seed = mi.UInt32(seed & 0xFFFFFFFF)
+        dr.make_opaque(seed)
+        seed = mix(seed + _SECOND)
         return cls(
             pattern=mix(seed ^ (lane // LANES_ALIKE) * _BY_LANE),
             own=mix(~seed ^ lane * _BY_LANE),

@@ -139,6 +139,26 @@ def test_a_picture_can_be_denoised(scene, tmp_path):
     assert np.abs(expected - noisy).max() > 0.01
 
 
+def test_indirect_light_is_denoised_apart(scene, tmp_path):
+    """For ours, without AOVs in the file that nobody asked for."""
+    output, kept = tmp_path / "denoised.exr", tmp_path / "kept.exr"
+    options = ("--integrator", "one_level_path", "--spp", 4, "--denoise")
+    assert run("render", scene, "-o", output, *options) == 0
+    assert run("render", scene, "-o", kept, *options, "--set", "indirect_aovs=true") == 0
+    assert pixels(output).shape[2] == pixels(kept).shape[2] - 9
+    scene_file = SceneFile(scene)
+    scene_file.configure_reconstruction_filters("box")
+    loaded = scene_file.load()
+    ours = mi.load_dict({"type": "one_level_path", "indirect_aovs": True})
+    noisy = np.array(mi.render(loaded, integrator=ours, spp=4, seed=0))
+    expected = denoise(loaded, noisy, 4, 0, indirect_aovs=True)
+    for path in (output, kept):
+        np.testing.assert_allclose(pixels(path)[..., :3], expected, atol=2e-3)
+    by_name = noisy[..., [-3, -2, -1, -6, -5, -4, -9, -8, -7]]  # as in files
+    np.testing.assert_allclose(pixels(kept)[..., -9:], by_name, atol=2e-3)
+    assert json.loads(header(output)["settings"])["integrator"] == "one_level_path"
+
+
 def test_films_can_be_resized(scene):
     mi.set_variant("llvm_ad_rgb")
     scene_file = SceneFile(scene)
