@@ -36,7 +36,8 @@ class CachedIntegrator(mi.SamplingIntegrator):
     """
 
     LEAST_PATCH_SAMPLES = 32
-    """By default; the noise of many patches averages out where secondary rays end in them."""
+    """If few camera samples share the cache; the noise of many patches averages out where secondary
+    rays end in them."""
 
     SHADOW_SAMPLES = 2
     """By default: shared irradiance has little noise, so direct light is worth a ray more."""
