@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import re
+import signal
 import tempfile
 from pathlib import Path
 
@@ -33,6 +34,8 @@ def pytest_configure(config):
     for layer, meaning in LAYERS.items():
         config.addinivalue_line("markers", f"{layer}: {meaning} (set by the folder)")
     config.addinivalue_line("markers", "variants(*names): run once in each Mitsuba variant")
+    # Shells start jobs in the background deaf to Ctrl-C, and their children inherit that.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_modifyitems(items):
