@@ -350,6 +350,8 @@ def _ids(index: int, item: Recipe) -> list[str]:
 
 def _object(name: str, item: Recipe, place) -> dict:
     x, y, z, angle = item["turn"]
+    if item["shape"] == "sdfgrid":
+        angle = 0  # Mitsuba warns of turned ones, and light leaks through turned instances of them.
     local = at(*item["at"]) @ mi.ScalarTransform4f().rotate([x, y, z], angle)
     local = local @ scaled(item["size"])
     bsdf = {"bsdf": material(item["bsdf"])}
