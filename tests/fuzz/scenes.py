@@ -498,18 +498,17 @@ class Means:
         return cls(values.mean(), values.std(ddof=1) / math.sqrt(seeds))
 
 
-class Implausible(AssertionError):
-    """No light looks like that."""
+class NotFinite(AssertionError):
+    """A picture has values that are no numbers, or infinite."""
 
 
 def render(scene, integrator, spp: int, seed: int) -> np.ndarray:
-    """A picture; ``Implausible`` unless it's finite and, but for residuals, not negative."""
+    """A picture, all its pixels finite and, but for residuals, not negative."""
     picture = np.array(mi.render(scene, integrator=integrator, spp=spp, seed=seed))
     if not np.isfinite(picture).all():
-        raise Implausible(f"{(~np.isfinite(picture)).sum()} values aren't finite")
+        raise NotFinite(f"{(~np.isfinite(picture)).sum()} values aren't finite")
     estimates_residual = getattr(integrator, "residual_probability", 0) > 0
-    if not (estimates_residual or (picture >= 0).all()):
-        raise Implausible(f"down to {picture.min()}")
+    assert estimates_residual or (picture >= 0).all(), f"down to {picture.min()}"
     return picture
 
 
@@ -535,7 +534,7 @@ def check(recipe: Recipe) -> None:
     for spp in (16, 256):  # The more expensive look only decides where the first one doubts.
         try:
             expected = Means.of(scene, path, 4 * spp, 8)
-        except Implausible:
+        except NotFinite:
             return  # Normals that are no numbers, for example.
         problem = disagreement(Means.of(scene, ours, spp, 8), expected, BIAS[recipe["integrator"]])
         if not problem:
