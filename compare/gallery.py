@@ -22,11 +22,11 @@ from scipy import stats
 from compare.metrics import Picture
 from compare.scene_kit import Description
 from envmap_integrator.cli.errors import condense
-from envmap_integrator.registration import _PLUGINS
+from envmap_integrator.registration import PLUGINS
 
 INTEGRATORS = tuple(
     name
-    for name, (module, _) in _PLUGINS.items()
+    for name, (module, _) in PLUGINS.items()
     if module.startswith("integrators.") and name != "envmap_bake"  # shows maps, not pictures
 )
 """Those that are judged: all that the package has."""

@@ -17,7 +17,7 @@ import numpy as np
 from compare.metrics import Picture
 from compare.scenes import PATH, Subject
 from envmap_integrator.cli.timing import compilation_time, measure, record_kernels
-from envmap_integrator.denoiser import denoise, warm_up
+from envmap_integrator.denoiser import denoise, prepare_for_denoiser, warm_up
 from envmap_integrator.progress import stage
 
 
@@ -126,8 +126,8 @@ def interleave(
         for index in range(n_runs):
             for task, measurements in zip(tasks, measured, strict=True):
                 integrator = task.subject.make(hide_emitters)
-                if task.denoise and hasattr(integrator, "indirect_aovs"):
-                    integrator.indirect_aovs = True
+                if task.denoise:
+                    prepare_for_denoiser(integrator)
                 measurements.settings = str(integrator)
                 measurements.runs.append(_timed_run(task, integrator, seed + index))
                 advance(1)
@@ -162,8 +162,7 @@ def _timed_run(task: Task, integrator: mi.Integrator, seed: int) -> Run:
     render_compile_s = compilation_time()
     with measure(seconds, "denoise"):
         if task.denoise:
-            indirect_aovs = getattr(integrator, "indirect_aovs", False)
-            denoised = denoise(task.scene, channels, task.spp, seed, indirect_aovs=indirect_aovs)
+            denoised = denoise(task.scene, integrator, channels, task.spp, seed)
     denoise_compile_s = compilation_time()
     return Run(
         seed=seed,

@@ -5,23 +5,33 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
+from .rendering.film import INDIRECT_AOVS
+
 GUIDE_SPP = 16
 """At most so many samples per pixel for albedo and normals, which have little noise."""
 
 
+def prepare_for_denoiser(integrator: mi.Integrator) -> bool:
+    """Have an integrator give the AOVs that help ``denoise``; whether it didn't, but does now."""
+    switched_on = getattr(integrator, "indirect_aovs", None) is False
+    if switched_on:
+        integrator.indirect_aovs = True
+    return switched_on
+
+
 def denoise(
     scene: mi.Scene,
+    integrator: mi.Integrator,
     picture: np.ndarray,
     spp: int,
     seed: int,
     sensor: int = 0,
-    indirect_aovs: bool = False,
 ) -> np.ndarray:
     """The denoised picture of a sensor, [H, W, 3]; the guides are rendered here.
 
-    The first three channels of ``picture`` are its colours. With ``indirect_aovs`` the last nine
-    are those of our integrators' parameter of that name. Then direct light and irradiance, which is
-    free of textures, are denoised apart: each has noise and edges of its own.
+    ``picture`` holds all channels that the integrator has rendered. Where the last of them are
+    ``INDIRECT_AOVS``, direct light and irradiance, which is free of textures, are denoised apart:
+    each has noise and edges of its own.
 
     The sensor's film is left with the guides. Raises ``ImportError`` if the optional package
     mitsuba-oidn is missing.
@@ -31,9 +41,10 @@ def denoise(
     channels = np.array(rendered, dtype=np.float32)
     albedo, normal = np.clip(channels[:, :, -6:-3], 0, 1), channels[:, :, -3:]
     colour = picture[:, :, :3]
-    if not indirect_aovs:
+    n_aovs = len(INDIRECT_AOVS)
+    if integrator.aov_names()[-n_aovs:] != list(INDIRECT_AOVS):
         return _filter(colour, albedo, normal)
-    indirect, gathered, reflectance = np.split(picture[:, :, -9:], 3, axis=2)
+    indirect, gathered, reflectance = np.split(picture[:, :, -n_aovs:], 3, axis=2)
     lit = reflectance > 0
     irradiance = np.where(lit, gathered / np.where(lit, reflectance, 1), 0)
     irradiance = _filter(irradiance, np.ones_like(albedo), normal)

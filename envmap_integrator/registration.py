@@ -16,7 +16,7 @@ _MODULES = (
     "emitters.mipmap_cube",
     "integrators.envmap_hybrid",
 )
-_PLUGINS = {
+PLUGINS = {
     "one_level_path": ("integrators.one_level_path", "OneLevelPath"),
     "source_selection": ("integrators.source_selection", "SourceSelection"),
     "envmap_bake": ("integrators.envmap_bake", "EnvmapBake"),
@@ -46,6 +46,6 @@ def _register() -> None:
             importlib.reload(sys.modules[full_name])
         else:
             importlib.import_module(full_name)
-    for plugin, (module, name) in _PLUGINS.items():
+    for plugin, (module, name) in PLUGINS.items():
         register_plugin = mi.register_emitter if plugin in _EMITTERS else mi.register_integrator
         register_plugin(plugin, getattr(sys.modules[f"{__package__}.{module}"], name))

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import mitsuba as mi
 
-from envmap_integrator.registration import _PLUGINS
+from envmap_integrator.registration import PLUGINS
 from tests.helpers import ROOT
 
 README = ROOT / "README.md"
@@ -37,7 +37,7 @@ def plugins() -> dict[str, type]:
     """The classes of all plugins by their names, for the active variant."""
     return {
         name: getattr(importlib.import_module(f"envmap_integrator.{module}"), class_name)
-        for name, (module, class_name) in _PLUGINS.items()
+        for name, (module, class_name) in PLUGINS.items()
     }
 
 

@@ -17,7 +17,7 @@ from envmap_integrator.atomic import check_writable
 from envmap_integrator.cli.output import write_bitmap, write_png
 from envmap_integrator.cli.scene_file import SceneFile
 from envmap_integrator.cli.timing import compilation_time, measure, record_kernels
-from envmap_integrator.denoiser import denoise, warm_up
+from envmap_integrator.denoiser import denoise, prepare_for_denoiser, warm_up
 from envmap_integrator.llvm import ensure_llvm
 
 
@@ -33,9 +33,7 @@ def render(args: argparse.Namespace) -> int:
         sensor = _sensor(scene, args.sensor)
         settings = _settings(args, scene_file, scene, sensor)
         integrator = scene.integrator()
-        for_denoiser = args.denoise and getattr(integrator, "indirect_aovs", None) is False
-        if for_denoiser:
-            integrator.indirect_aovs = True
+        for_denoiser = args.denoise and prepare_for_denoiser(integrator)
         if args.denoise:  # Fails before the work starts, if there is no denoiser.
             warm_up(*sensor.film().crop_size())
         if hasattr(integrator, "prepare"):
@@ -73,8 +71,7 @@ def _denoise(bitmap: mi.Bitmap, scene: mi.Scene, settings: dict[str, object]) ->
         '"pixel_format" to rgb or rgba',
     )
     spp, seed, sensor = (settings[key] for key in ("spp", "seed", "sensor"))
-    indirect_aovs = getattr(scene.integrator(), "indirect_aovs", False)
-    pixels[:, :, :3] = denoise(scene, pixels, spp, seed, sensor, indirect_aovs)
+    pixels[:, :, :3] = denoise(scene, scene.integrator(), pixels, spp, seed, sensor)
 
 
 def bake(args: argparse.Namespace) -> int:

@@ -12,7 +12,7 @@ from ..parameters import Parameters
 from ..pipeline import Prepared, Settings, load, prepare
 from ..radiosity.surface_points import ObjectIds
 from ..rendering.camera import CameraSample, camera_radiance
-from ..rendering.film import INDIRECT_AOVS, expose, expose_gathered, most_samples, rgb
+from ..rendering.film import INDIRECT_AOVS, expose, expose_gathered, most_samples, n_pixels_of, rgb
 from ..rendering.source_choice import Emitters, SourceChoice
 from ..rendering.transport import Residual, Transport
 
@@ -214,5 +214,4 @@ def _camera_samples(scene: mi.Scene, sensor: mi.Sensor | int, spp: int) -> int:
         if not scene.sensors():
             return 0
         sensor = scene.sensors()[sensor]
-    width, height = (int(n) for n in sensor.film().crop_size())
-    return width * height * (spp or sensor.sampler().sample_count())
+    return n_pixels_of(sensor.film()) * (spp or sensor.sampler().sample_count())

@@ -24,7 +24,7 @@ MIN_LANES, MAX_LANES = 1 << 20, (1 << 32) - 1
 
 def most_samples(sensor: mi.Sensor) -> int:
     """Samples per pixel at most with Mitsuba's samplers, which need a lane for each."""
-    return MAX_LANES // _pixels(sensor.film())
+    return MAX_LANES // n_pixels_of(sensor.film())
 
 
 def expose(sensor, sampler, spp, seed, shade, names: list[str], aovs) -> None:
@@ -91,7 +91,7 @@ def _accumulate(sensor, sampler, spp, seed, shade, channels, n_further) -> list[
     """Sums over the samples of each pixel, row by row, of ``channels(found, weight)``."""
     film = sensor.film()
     pixel_filter = PixelFilter(film.rfilter())
-    n_pixels, width = _pixels(film), dr.opaque(mi.UInt32, int(film.crop_size()[0]))
+    n_pixels, width = n_pixels_of(film), dr.opaque(mi.UInt32, int(film.crop_size()[0]))
     corner = mi.Vector2i(film.crop_offset())
 
     def values(sampler, pixel, index):
@@ -175,7 +175,8 @@ def _sample(sensor, pixel_filter, sampler, shade, position, index):
     return found.scaled(weight * filter_weight), filter_weight
 
 
-def _pixels(film: mi.Film) -> int:
+def n_pixels_of(film: mi.Film) -> int:
+    """Pixels that a film keeps."""
     return int(film.crop_size()[0]) * int(film.crop_size()[1])
 
 

@@ -134,7 +134,7 @@ def test_a_picture_can_be_denoised(scene, tmp_path):
     scene_file.configure_reconstruction_filters("box")
     loaded = scene_file.load()
     noisy = np.array(mi.render(loaded, spp=4, seed=0))[..., :3]
-    expected = denoise(loaded, noisy, 4, 0)
+    expected = denoise(loaded, loaded.integrator(), noisy, 4, 0)
     np.testing.assert_allclose(pixels(output)[..., :3], expected, atol=2e-3)
     assert np.abs(expected - noisy).max() > 0.01
 
@@ -151,7 +151,7 @@ def test_indirect_light_is_denoised_apart(scene, tmp_path):
     loaded = scene_file.load()
     ours = mi.load_dict({"type": "one_level_path", "indirect_aovs": True})
     noisy = np.array(mi.render(loaded, integrator=ours, spp=4, seed=0))
-    expected = denoise(loaded, noisy, 4, 0, indirect_aovs=True)
+    expected = denoise(loaded, ours, noisy, 4, 0)
     for path in (output, kept):
         np.testing.assert_allclose(pixels(path)[..., :3], expected, atol=2e-3)
     by_name = noisy[..., [-3, -2, -1, -6, -5, -4, -9, -8, -7]]  # as in files
