@@ -22,6 +22,7 @@ from compare.scene_kit import (
     camera,
     checkers,
     cluster,
+    colour,
     curve,
     emitting,
     film,
@@ -484,6 +485,16 @@ MATERIALS = {
     ),
     "mirror that shines": Case(lambda: with_ball("conductor", radiance=1.0), ROOM),
     "glass that shines": Case(lambda: with_ball("dielectric", radiance=1.0), ROOM),
+    # Without a sky, path drops what a pane emits where nothing solid is behind it.
+    "a pane that shines before a black sky": Case(
+        lambda: small_open(
+            sky={"type": "constant", "radiance": colour(0), "sampling_weight": 0.0},
+            ball=ball(0, -0.5, 0.2, 0.5) | of("thindielectric") | emitting(1),
+            sensor=look(target=(0, 0.5, 0)),
+        ),
+        enclosed(1, 0.7),
+        spp=64,
+    ),
     "mirror": Case(lambda: with_ball("conductor"), ROOM, precision=0.03),
     "metal of roughness 0.001": Case(
         lambda: with_ball("roughconductor", alpha=0.001), ROOM, precision=0.03
