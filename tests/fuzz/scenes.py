@@ -353,10 +353,10 @@ def _ids(index: int, item: Recipe) -> list[str]:
 
 
 def _object(name: str, item: Recipe, place) -> dict:
-    x, y, z, angle = item["turn"]
-    if item["shape"] == "sdfgrid":
-        angle = 0  # Mitsuba warns of turned ones, and light leaks through turned instances of them.
-    local = at(*item["at"]) @ mi.ScalarTransform4f().rotate([x, y, z], angle)
+    local = at(*item["at"])
+    # Mitsuba warns of turned SDF grids, and light leaks through turned instances of them.
+    if item["shape"] != "sdfgrid":
+        local = local @ rotation(item["turn"])
     local = local @ scaled(item["size"])
     bsdf = {"bsdf": material(item["bsdf"])}
     if not item["instances"]:
@@ -374,6 +374,14 @@ def _object(name: str, item: Recipe, place) -> dict:
         for i in range(item["instances"])
     }
     return {f"{name}group": group, **copies}
+
+
+def rotation(turn: list[float]) -> mi.ScalarTransform4f:
+    """About an axis, by an angle. Mitsuba shears if the axis isn't of length one, and samples of
+    the light of a sheared sphere aren't on it.
+    """
+    *axis, angle = turn
+    return mi.ScalarTransform4f().rotate(np.array(axis) / np.linalg.norm(axis), angle)
 
 
 def _emission(radiance) -> dict:

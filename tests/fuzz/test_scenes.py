@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 
-from tests.fuzz.scenes import Palette, applicable_mistake, check, recipes
+from tests.fuzz.scenes import Palette, applicable_mistake, check, recipes, rotation
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -32,6 +33,12 @@ def test_random_scenes(number):
         check(recipe)
 
     passes()
+
+
+@pytest.mark.parametrize("axis", [[1, 0, 0], [1, 1, 1]])
+def test_objects_are_turned_without_shearing(axis):
+    matrix = np.array(rotation([*axis, 50.0]).matrix)
+    np.testing.assert_allclose(matrix @ matrix.T, np.eye(4), atol=1e-6)
 
 
 def test_mistakes_are_only_those_that_an_integrator_can_make():
