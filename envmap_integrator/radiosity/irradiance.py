@@ -24,15 +24,11 @@ from .surface_points import SurfacePoints
 if TYPE_CHECKING:
     from ..rendering.transport import Transport
 
-#: Part of the irradiance that may be missing before the last extrapolation, which leaves about a
-#: tenth of it.
-TOLERANCE = 1e-4
+#: Relative change of the irradiance at which the solution counts as converged.
+TOLERANCE = 1e-5
 MAX_ITERATIONS = 256
-#: Iterations between extrapolations: each makes the host wait, and lets other than the slowest
-#: mode of the light die down.
-EXTRAPOLATE_EVERY = 4
-#: What remains of the last change at most, as an extrapolation believes.
-MAX_DECAY = 0.95
+#: Iterations between tests of that: each makes the host wait.
+CHECK_EVERY = 4
 #: Steps of the R2 sequence (Roberts 2018).
 R2 = (0.7548776662466927, 0.5698402909980532)
 #: Gather rays per kernel launch: bounds memory.
@@ -193,11 +189,7 @@ def _concatenate(parts):
 
 
 def _solve(n_patches, patch, direct, escaped, weight, row, samples):
-    """Iterate E_i = escaped + mean(w E(row)) to convergence; returns the irradiance table.
-
-    Changes soon shrink by the same factor in each iteration. From time to time the sum of the
-    geometric series that they then are is added at once (Aitken 1926).
-    """
+    """Iterate E_i = escaped + mean(w E(row)) to convergence; returns the irradiance table."""
     direct, escaped = dr.ravel(direct), dr.ravel(escaped)
     table = dr.zeros(mi.Float, 2 * n_patches * len(weight))
 
@@ -207,24 +199,19 @@ def _solve(n_patches, patch, direct, escaped, weight, row, samples):
         dr.eval(table)
 
     indirect = mi.Float(escaped)
-    change = dr.zeros(mi.Float)
     with stage("Solving irradiance"):
-        for iteration in range(1, MAX_ITERATIONS + 1):
+        for iteration in range(MAX_ITERATIONS):
             store(indirect)
             arriving = weight * dr.gather(mi.Spectrum, table, row)
             dr.eval(arriving)  # Once, not for every block sum.
             arriving = mi.Spectrum(*(dr.block_sum(c, samples) / samples for c in arriving))
             previous, indirect = indirect, escaped + dr.ravel(arriving)
-            previous_change, change = change, indirect - previous
-            if iteration % EXTRAPOLATE_EVERY:
+            if iteration % CHECK_EVERY:
                 continue
-            sums = [dr.sum(dr.abs(x)) for x in (previous_change, change, direct + indirect)]
-            dr.eval(indirect, change, sums)
-            before, now, level = (value[0] for value in sums)
-            decay = min(now / before, MAX_DECAY) if now < before else 0.0
-            missing = decay / (1 - decay)
-            indirect = dr.maximum(indirect + dr.opaque(mi.Float, missing) * change, 0)
-            if max(missing, 1) * now <= TOLERANCE * level:
+            change = dr.sum(dr.abs(indirect - previous))
+            level = dr.sum(direct + indirect)
+            dr.eval(indirect, change, level)
+            if change[0] <= TOLERANCE * level[0]:
                 break
     store(indirect)
     return table
