@@ -130,7 +130,7 @@ def prepare(scene: mi.Scene, key: str, settings: Settings, owner: str, baker=Non
     with _timed(times, "direct light"):
         emitters = Emitters(scene)
         light = survey_direct_light(scene, emitters, points, patch_of_point, patches.count)
-        sources = choose_sources(emitters, light, cell_of_point, dr.width(patches.levels))
+        sources = choose_sources(emitters, light, points, cell_of_point, patches)
         patches, patch_of_point = drop_uneven(light, patches, patch_of_point)
 
     with _timed(times, "irradiance cache"):

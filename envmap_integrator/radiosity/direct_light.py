@@ -8,16 +8,19 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..jit import upload
+from ..jit import upload, upload_vectors
 from ..rendering.ray_counts import Ray, count
 from ..rendering.source_choice import Emitters, SourceChoice, alias_tables, by_weight
 from .patch_points import PatchPoints
+from .patches import Patches, normal_direction
 from .surface_points import SurfacePoints
 
 #: Shadow rays per patch.
 SAMPLES = 128
 #: Part of the shadow rays that goes to emitters regardless of what has been found of them.
 UNINFORMED = 0.1
+#: Shadow rays per emitter from which on what they find of each tells emitters apart.
+RAYS_PER_EMITTER = 8
 
 
 @dataclass(frozen=True)
@@ -65,35 +68,87 @@ def survey_direct_light(
 
 
 def choose_sources(
-    emitters: Emitters, light: DirectLight, cell_of_point: np.ndarray, n_cells: int
+    emitters: Emitters,
+    light: DirectLight,
+    points: SurfacePoints,
+    cell_of_point: np.ndarray,
+    patches: Patches,
 ) -> SourceChoice:
     """Probabilities of the emitters in each large cell, by the light found of them there.
 
     In proportion to the root mean square: to the mean, near lamps would get too few shadow rays.
     What doesn't shine on any patch keeps a small probability; ``sampling_weight`` scales all.
+    Cells with too few shadow rays to tell so many emitters apart share what has been found in
+    their surroundings.
     """
     n, weights = emitters.count, emitters.weights
     if n < 2:
         return by_weight(emitters)
-    cell = cell_of_point[light.members.index[light.members.first[:-1]]]
     emitter = light.emitter.numpy().astype(np.int64)
     # The irradiance has been divided by the weights.
     square = np.square(light.irradiance.numpy().astype(np.float64)) * weights[emitter]
     if not square.any():
         return by_weight(emitters)
-    cell = np.repeat(cell, SAMPLES)
-    inside = (cell >= 0) & (square > 0)
-    # Most slots of the cells' hash table are empty, and share the last row.
-    known = np.bincount(cell[inside], minlength=n_cells) > 0
-    row_of_cell = np.where(known, np.cumsum(known) - 1, known.sum())
-    slot = row_of_cell[cell[inside]] * n + emitter[inside]
-    found = np.bincount(slot, square[inside], (known.sum() + 1) * n).reshape(-1, n)
-    found[-1] = np.bincount(emitter, square, n)
-    found = np.sqrt(found)
+
+    # ---- Which rays left from each cell ----
+    point = light.members.index[light.members.first[:-1]]
+    in_cell = cell_of_point[point] >= 0
+    point = point[in_cell]
+    cells, first, cell = np.unique(cell_of_point[point], return_index=True, return_inverse=True)
+    n_rays = SAMPLES * np.bincount(cell, minlength=len(cells))
+    lit = square.reshape(-1, SAMPLES)[in_cell] > 0
+    cell = np.repeat(cell, lit.sum(axis=1))
+    lit_by = emitter.reshape(-1, SAMPLES)[in_cell][lit]
+    lit_square = square.reshape(-1, SAMPLES)[in_cell][lit]
+    n_lit = np.bincount(cell, minlength=len(cells))
+
+    # ---- A row for the smallest surroundings of each cell that rays enough left from ----
+    row = np.full(len(cells), -1)
+    rows, n_rows = [], 0
+    for group, smallest in _surroundings(points, point[first], patches, n_rays, n):
+        lit_here = smallest & (np.bincount(group, n_lit)[group] > 0)
+        used, row_of_cell = np.unique(group[lit_here], return_inverse=True)
+        row[lit_here] = n_rows + row_of_cell
+        rank = np.full(group.max(initial=0) + 1, -1)
+        rank[used] = np.arange(len(used))
+        there = rank[group][cell]
+        slot = (there * n + lit_by)[there >= 0]
+        found = np.bincount(slot, lit_square[there >= 0], len(used) * n)
+        rows.append(found.reshape(-1, n))
+        n_rows += len(used)
+    # The last row is for the rest, and for the empty slots of the cells' hash table.
+    rows.append(np.bincount(emitter, square, n)[None])
+    row_of_cell = np.full(dr.width(patches.levels), n_rows)
+    row_of_cell[cells] = np.where(row < 0, n_rows, row)
+
+    found = np.sqrt(np.concatenate(rows))
     found /= found.sum(axis=1, keepdims=True)
     probability = (1 - UNINFORMED) * found + UNINFORMED * weights
     table = upload(mi.Float, alias_tables(probability))
     return SourceChoice(emitters, table, upload(mi.UInt32, row_of_cell))
+
+
+def _surroundings(points, index, patches, n_rays, n_emitters):
+    """Ever larger groups of the C cells, until each is in one that rays enough left from.
+
+    First each cell is its own group; then those that face the same way in cubes of twice the edge,
+    four times … ``index`` gives a surface point of each cell. Yields ``(group, smallest)``: the
+    group [C] of each cell, and whether it's the smallest that will do.
+    """
+    enough = RAYS_PER_EMITTER * n_emitters
+    position = points.position[index] - patches.origin.numpy().ravel()
+    facing = normal_direction(upload_vectors(mi.Normal3f, points.normal[index])).numpy()
+    group, size = np.arange(len(index)), patches.size[0]
+    waiting = np.ones(len(index), dtype=bool)
+    while True:
+        informed = np.bincount(group, n_rays)[group] >= enough
+        yield group, waiting & informed
+        waiting &= ~informed
+        if size > points.extent or not waiting.any():
+            return
+        size *= 2
+        cube = np.floor(position / size).astype(np.int64)
+        group = np.unique(np.c_[facing, cube], axis=0, return_inverse=True)[1].ravel()
 
 
 def sample_irradiance(scene, choice, si, row, u):

@@ -10,7 +10,12 @@ from numpy.testing import assert_allclose
 from scipy import stats
 
 from envmap_integrator.jit import upload
-from envmap_integrator.radiosity.direct_light import choose_sources, survey_direct_light
+from envmap_integrator.radiosity.direct_light import (
+    RAYS_PER_EMITTER,
+    SAMPLES,
+    choose_sources,
+    survey_direct_light,
+)
 from envmap_integrator.rendering.source_choice import (
     Emitters,
     SourceChoice,
@@ -55,14 +60,18 @@ def hall(variant) -> CoarseMesh:
 
 @pytest.fixture(scope="module")
 def choice(hall) -> SourceChoice:
+    return choice_in(hall)
+
+
+def choice_in(hall) -> SourceChoice:
     emitters = Emitters(hall.scene)
     light = survey_direct_light(
         hall.scene, emitters, hall.points, hall.patch_of_point, hall.patches.count
     )
-    return choose_sources(emitters, light, hall.cell_of_point, dr.width(hall.patches.levels))
+    return choose_sources(emitters, light, hall.points, hall.cell_of_point, hall.patches)
 
 
-def on_the_floor(hall, x: float, n: int = 1):
+def on_the_floor(hall, x: float | mi.Float, n: int = 1):
     """An interaction at (x, 0, 0) and the cell it lies in."""
     si = dr.zeros(mi.SurfaceInteraction3f, n)
     si.p, si.n = mi.Point3f(x, 0.1, 0), mi.Normal3f(0, 0, 1)
@@ -135,6 +144,30 @@ def test_rows_are_for_cells_that_are_lit(choice):
     n_rows = len(choice.table.numpy()) // (4 * choice.emitters.count)
     used = rows[rows < n_rows - 1]
     assert len(np.unique(used)) == len(used) == n_rows - 1 < len(rows) / 2
+
+
+def test_many_lamps_are_told_apart():
+    """Where the shadow rays of a cell are too few for that, those of its surroundings help."""
+    random = np.random.default_rng(5)
+    lamps = [lamp_at(x) for x in random.uniform(-7.5, 7.5, 150)]
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([8, 1, 1])} | grey(0.5)
+    hall = coarse_mesh(scene_of(floor, *lamps), budget=512, points_per_patch=64)
+    choice = choice_in(hall)
+    n_emitters = choice.emitters.count
+    n_rows = len(choice.table.numpy()) // (4 * n_emitters)
+    assert 4 < n_rows < hall.patches.count * SAMPLES / (RAYS_PER_EMITTER * n_emitters)
+
+    n = 1 << 16
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(6, n)
+    si, cell, found = on_the_floor(hall, 16 * sampler.next_1d() - 8, n)
+
+    def error(choice):
+        row = choice.row(cell, found)
+        ds, weight = choice.sample_direction(si, row, sampler.next_2d(), True)
+        return np.std((weight.x * dr.maximum(ds.d.z, 0)).numpy())
+
+    assert error(choice) < 0.5 * error(by_weight(choice.emitters))
 
 
 def test_sampling_weights_count():
