@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.sparse.linalg import LinearOperator, gmres
 
 from ..jit import give_back, mix, unit, upload
 from ..progress import stage
@@ -26,9 +27,9 @@ if TYPE_CHECKING:
 
 #: Relative change of the irradiance at which the solution counts as converged.
 TOLERANCE = 1e-5
-MAX_ITERATIONS = 256
-#: Iterations between tests of that: each makes the host wait.
-CHECK_EVERY = 4
+#: Bounces that are followed one by one, those between tests of that (each makes the host wait), and
+#: directions that the rest is searched in at a time.
+MAX_BOUNCES, CHECK_EVERY, KRYLOV = 64, 4, 32
 #: Steps of the R2 sequence (Roberts 2018).
 R2 = (0.7548776662466927, 0.5698402909980532)
 #: Gather rays per kernel launch: bounds memory.
@@ -189,23 +190,29 @@ def _concatenate(parts):
 
 
 def _solve(n_patches, patch, direct, escaped, weight, row, samples):
-    """Iterate E_i = escaped + mean(w E(row)) to convergence; returns the irradiance table."""
+    """Solve E_i = escaped + mean(w E(row)), bounce by bounce; returns the irradiance table.
+
+    What is left after ``MAX_BOUNCES``, in rooms that are almost white, is solved for at once.
+    """
     direct, escaped = dr.ravel(direct), dr.ravel(escaped)
     table = dr.zeros(mi.Float, 2 * n_patches * len(weight))
 
-    def store(indirect):
+    def store(direct, indirect):
         dr.scatter(table, dr.unravel(mi.Spectrum, direct + indirect), 2 * patch)
         dr.scatter(table, dr.unravel(mi.Spectrum, indirect), 2 * patch + 1)
         dr.eval(table)
 
+    def bounce(direct, indirect):
+        """What patches receive from each other."""
+        store(direct, indirect)
+        arriving = weight * dr.gather(mi.Spectrum, table, row)
+        dr.eval(arriving)  # Once, not for every block sum.
+        return dr.ravel(type(weight)(*(dr.block_sum(c, samples) / samples for c in arriving)))
+
     indirect = mi.Float(escaped)
     with stage("Solving irradiance"):
-        for iteration in range(MAX_ITERATIONS):
-            store(indirect)
-            arriving = weight * dr.gather(mi.Spectrum, table, row)
-            dr.eval(arriving)  # Once, not for every block sum.
-            arriving = mi.Spectrum(*(dr.block_sum(c, samples) / samples for c in arriving))
-            previous, indirect = indirect, escaped + dr.ravel(arriving)
+        for iteration in range(MAX_BOUNCES):
+            previous, indirect = indirect, escaped + bounce(direct, indirect)
             if iteration % CHECK_EVERY:
                 continue
             change = dr.sum(dr.abs(indirect - previous))
@@ -213,5 +220,31 @@ def _solve(n_patches, patch, direct, escaped, weight, row, samples):
             dr.eval(indirect, change, level)
             if change[0] <= TOLERANCE * level[0]:
                 break
-    store(indirect)
+        else:
+            missing = escaped + bounce(direct, indirect) - indirect
+            indirect += _all_bounces(lambda light: bounce(mi.Float(0), light), missing, indirect)
+    store(direct, indirect)
     return table
+
+
+def _all_bounces(bounce, light: mi.Float, scale: mi.Float) -> mi.Float:
+    """Sum of ``light`` and what comes of it by all further bounces: GMRES (Saad and Schultz 1986).
+
+    Errors are measured by ``scale``, what each patch has already: else dark rooms beside bright
+    ones would get theirs. Where a solution is less than ``light`` itself, or there is none, the sum
+    is infinite, as patches reflect what they receive, or more by noise: only ``light`` is returned.
+    """
+    light, scale = (x.numpy().astype(np.float64) for x in (light, scale))
+    scale = np.maximum(scale, 1e-4 * scale.mean())
+    n = len(light)
+
+    def remaining(x):
+        return x - bounce(upload(mi.Float, scale * x)).numpy() / scale
+
+    system = LinearOperator((n, n), remaining, dtype=np.float64)
+    found, unsolved = gmres(
+        system, light / scale, rtol=0, atol=TOLERANCE * np.sqrt(n), restart=KRYLOV, maxiter=2
+    )
+    if unsolved or np.any(scale * found < 0.99 * light):
+        found = light / scale
+    return upload(mi.Float, scale * found)

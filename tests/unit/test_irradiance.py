@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from envmap_integrator.radiosity.irradiance import TOLERANCE
+from envmap_integrator.radiosity.irradiance import MAX_BOUNCES, TOLERANCE
 from tests.helpers import QUANTILE, assert_agree, at, ball, box, emitting, exactly, grey
 from tests.unit.kit import WALL, CoarseMesh, coarse_mesh, mean_of, mesh, scene_of
 
@@ -69,6 +69,22 @@ def test_a_furnace(albedo):
     assert_agree(mean_of(total - indirect), exactly(np.pi * 0.5), allowed=5e-4)
     assert_allclose(total, expected, rtol=0.1)
     assert light.total[~inside].max() < 1e-6 * expected
+
+
+@pytest.mark.parametrize("albedo", [0.9, 0.99, 0.999])
+def test_an_almost_white_furnace(albedo):
+    """Hundreds of bounces count there. Each repeats the error of the one before."""
+    light = received(coarse_mesh(scene_of(box(1) | grey(albedo) | emitting(0.5)), BUDGET))
+    inside = (light.position * light.normal).sum(axis=1) < 0
+    assert_allclose(light.total[inside], np.pi * 0.5 / (1 - albedo), rtol=5e-3)
+    assert_allclose(light.indirect[inside], albedo * light.total[inside], rtol=5e-3)
+
+
+def test_a_furnace_that_loses_nothing():
+    """It has no finite solution: the light of some bounces is what it gets."""
+    light = received(coarse_mesh(scene_of(box(1) | grey(1.0) | emitting(0.5)), BUDGET))
+    inside = (light.position * light.normal).sum(axis=1) < 0
+    assert_allclose(light.total[inside], np.pi * 0.5 * (MAX_BOUNCES + 2), rtol=0.01)
 
 
 @pytest.mark.variants("llvm_ad_rgb", "llvm_ad_mono")
