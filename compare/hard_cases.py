@@ -14,6 +14,7 @@ import numpy as np
 
 from compare.gallery import Case
 from compare.scene_kit import (
+    BLACK_SKY,
     Description,
     at,
     ball,
@@ -22,7 +23,6 @@ from compare.scene_kit import (
     camera,
     checkers,
     cluster,
-    colour,
     curve,
     emitting,
     film,
@@ -479,16 +479,24 @@ MATERIALS = {
         ),
         enclosed(LAMP, 0.9),
     ),
+    "almost white": Case(
+        lambda: small_room(
+            walls=box(2) | grey(0.98),
+            block=block(*BLOCK, 0.4) | grey(0.98),
+            ball=ball(0.4, 0.2, -1.6, 0.4) | grey(0.98),
+        ),
+        enclosed(LAMP, 0.98),
+        spp=64,
+    ),
     "all black": Case(lambda: small_room(walls=box(2) | grey(0), block=None, ball=None), LAMP),
     "textures of 0 and 1": Case(
         lambda: with_ball("diffuse", reflectance=checkers()), enclosed(LAMP, 0.9)
     ),
     "mirror that shines": Case(lambda: with_ball("conductor", radiance=1.0), ROOM),
     "glass that shines": Case(lambda: with_ball("dielectric", radiance=1.0), ROOM),
-    # Without a sky, path drops what a pane emits where nothing solid is behind it.
     "a pane that shines before a black sky": Case(
         lambda: small_open(
-            sky={"type": "constant", "radiance": colour(0), "sampling_weight": 0.0},
+            sky=BLACK_SKY,
             ball=ball(0, -0.5, 0.2, 0.5) | of("thindielectric") | emitting(1),
             sensor=look(target=(0, 0.5, 0)),
         ),

@@ -11,6 +11,10 @@ import numpy as np
 
 Description = dict[str, Any]
 
+BLACK_SKY = {"type": "constant", "radiance": {"type": "rgb", "value": 0}, "sampling_weight": 0.0}
+"""Lights nothing and gets no shadow rays, but is there: without any sky, ``path`` drops all light
+of a path that meets nothing solid, also what a luminous pane of glass emits."""
+
 
 def room(**changes: Any) -> Description:
     """A closed grey room, 4 wide, with a lamp under its ceiling, a block and a ball on the floor.
