@@ -42,9 +42,19 @@ def test_furnace():
 
 
 def test_atrium(tmp_path):
-    command = [sys.executable, SCENES / "make_atrium.py", "--triangles", "10000", "--out", tmp_path]
-    subprocess.run([*map(str, command)], check=True)
+    made_by("make_atrium.py", "--triangles", 10000, "--out", tmp_path)
     assert_like_path(load_scene(SCENES / "atrium.xml", WIDTH, HEIGHT, data=str(tmp_path)))
+
+
+@pytest.mark.parametrize("scattered", [[], ["--scattered"]], ids=["ceiling", "scattered"])
+def test_many_lamps(tmp_path, scattered):
+    made_by("make_lamps.py", "--lamps", 200, "--out", tmp_path, *scattered)
+    (path,) = tmp_path.iterdir()
+    assert_like_path(load_scene(path, WIDTH, HEIGHT), allowed=0.01)
+
+
+def made_by(script: str, *arguments) -> None:
+    subprocess.run([*map(str, (sys.executable, SCENES / script, *arguments))], check=True)
 
 
 @pytest.mark.slow
