@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import hashlib
+from concurrent.futures import ThreadPoolExecutor
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from .scene_order import ordered_shapes
+
+#: Bytes that a thread hashes at a time.
+BLOCK = 1 << 22
 
 
 class SceneFingerprint:
@@ -28,17 +32,27 @@ class SceneFingerprint:
         arrays, scalars = _parameters(scene)
         indices = tuple(_index(array) for array in arrays)
         if indices != self._indices or scalars != self._scalars or not self._hash:
+            unique = dict(zip(indices, arrays, strict=True))  # Shapes share materials and textures.
+            with ThreadPoolExecutor() as pool:
+                parts = {index: pool.map(_digest, _blocks(unique[index])) for index in unique}
+            digests = {index: b"".join(parts[index]) for index in unique}
             digest = hashlib.blake2b(scalars.encode(), digest_size=16)
-            known: dict[tuple, bytes] = {}
-            for array, index in zip(arrays, indices, strict=True):
-                if index not in known:  # Shapes share materials and textures.
-                    data = np.ascontiguousarray(array.numpy())
-                    known[index] = hashlib.blake2b(data, digest_size=16).digest()
-                digest.update(known[index])
+            for index in indices:
+                digest.update(digests[index])
             # Holding on to the arrays keeps Dr.Jit from giving their indices to others.
             self._arrays, self._indices, self._scalars = arrays, indices, scalars
             self._hash = digest.hexdigest()
         return self._hash
+
+
+def _blocks(array) -> list[np.ndarray]:
+    """The content of an array, in pieces for several threads."""
+    data = np.ascontiguousarray(array.numpy()).reshape(-1).view(np.uint8)
+    return [data[begin : begin + BLOCK] for begin in range(0, len(data), BLOCK)]
+
+
+def _digest(data: np.ndarray) -> bytes:
+    return hashlib.blake2b(data, digest_size=16).digest()
 
 
 def _parameters(scene: mi.Scene) -> tuple[tuple, str]:
