@@ -54,6 +54,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
         self.residual_probability = 0.0
         self.irradiance_filter = False
         self.indirect_aovs = False
+        self.clamp_indirect = 0.0
         self.sampler = parameters.choice("sampler", "coherent", SAMPLERS)
         self.cache_file = parameters.text("cache_file")
         self._fingerprint = SceneFingerprint()
@@ -128,6 +129,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
             SourceChoice(emitters, prepared.sources, prepared.source_rows),
             cache=prepared.cache,
             shadow_samples=self.shadow_samples,
+            clamp=dr.opaque(mi.Float, self.clamp_indirect) if self.clamp_indirect else None,
             **more,
         )
 
@@ -206,6 +208,19 @@ class CachedIntegrator(mi.SamplingIntegrator):
         """As ``camera_radiance``, with the integrator's own number of secondary rays."""
         ray, active = mi.Ray3f(ray), mi.Bool(active)
         return camera_radiance(scene, transport, sampler, ray, active, self.secondary_samples)
+
+
+class GatheringIntegrator(CachedIntegrator):
+    """Base of those that send secondary rays before paths end."""
+
+    def __init__(self, props: mi.Properties):
+        super().__init__(props)
+        parameters = Parameters(props)
+        self.secondary_samples = parameters.integer("secondary_samples", 1, 1, 1 << 16)
+        self.residual_probability = parameters.number("residual_probability", 0.0, 0.0, 1.0)
+        self.irradiance_filter = parameters.flag("irradiance_filter", True)
+        self.indirect_aovs = parameters.flag("indirect_aovs", False)
+        self.clamp_indirect = parameters.number("clamp_indirect", 0.0, 0.0)
 
 
 def _camera_samples(scene: mi.Scene, sensor: mi.Sensor | int, spp: int) -> int:

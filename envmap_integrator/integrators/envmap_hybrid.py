@@ -8,11 +8,11 @@ from ..emitters.mipmap_cube import MipmapCube
 from ..maps.cube_map import MAX_RESOLUTION
 from ..maps.far_field import FarField, far_field
 from ..parameters import Parameters
-from .common import CachedIntegrator
+from .common import GatheringIntegrator
 from .envmap_bake import EnvmapBake
 
 
-class EnvmapHybrid(CachedIntegrator):
+class EnvmapHybrid(GatheringIntegrator):
     r"""
     Environment mapping for diffuse interreflection (:monosp:`envmap_hybrid`)
 
@@ -86,6 +86,10 @@ class EnvmapHybrid(CachedIntegrator):
        - Also give the indirect light that diffuse surfaces gather, as AOVs: ``indirect`` as in the
          picture, ``gathered`` before pixels share it, and ``albedo``, what it's in proportion to.
          The denoiser takes it apart from direct light. (Default: false)
+     * - clamp_indirect
+       - |float|
+       - Largest radiance [W/m²/sr] that a secondary ray may bring: cuts fireflies, and the light of
+         caustics with them. 0 cuts nothing. (Default: 0)
      * - sampler
        - |string|
        - Sample points: ``coherent`` ones of our own, stratified in each pixel and much alike in
@@ -122,10 +126,6 @@ class EnvmapHybrid(CachedIntegrator):
     def __init__(self, props: mi.Properties):
         super().__init__(props)
         parameters = Parameters(props)
-        self.secondary_samples = parameters.integer("secondary_samples", 1, 1, 1 << 16)
-        self.residual_probability = parameters.number("residual_probability", 0.0, 0.0, 1.0)
-        self.irradiance_filter = parameters.flag("irradiance_filter", True)
-        self.indirect_aovs = parameters.flag("indirect_aovs", False)
         self.gather_depth = parameters.integer("gather_depth", 1, 1, 64)
         self.second_hit = parameters.choice("second_hit", "cache", ("cache", "shadow_rays"))
         self.lookup = parameters.choice("lookup", "corrected", ("corrected", "plain"))

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import mitsuba as mi
-
-from ..parameters import Parameters
-from .common import CachedIntegrator
+from .common import GatheringIntegrator
 
 
-class OneLevelPath(CachedIntegrator):
+class OneLevelPath(GatheringIntegrator):
     r"""
     One-level path tracing (:monosp:`one_level_path`)
 
@@ -45,6 +42,10 @@ class OneLevelPath(CachedIntegrator):
        - Also give the indirect light that diffuse surfaces gather, as AOVs: ``indirect`` as in the
          picture, ``gathered`` before pixels share it, and ``albedo``, what it's in proportion to.
          The denoiser takes it apart from direct light. (Default: false)
+     * - clamp_indirect
+       - |float|
+       - Largest radiance [W/m²/sr] that a secondary ray may bring: cuts fireflies, and the light of
+         caustics with them. 0 cuts nothing. (Default: 0)
      * - sampler
        - |string|
        - Sample points: ``coherent`` ones of our own, stratified in each pixel and much alike in
@@ -57,14 +58,6 @@ class OneLevelPath(CachedIntegrator):
        - |bool|
        - Hide directly visible emitters. (Default: false)
     """
-
-    def __init__(self, props: mi.Properties):
-        super().__init__(props)
-        parameters = Parameters(props)
-        self.secondary_samples = parameters.integer("secondary_samples", 1, 1, 1 << 16)
-        self.residual_probability = parameters.number("residual_probability", 0.0, 0.0, 1.0)
-        self.irradiance_filter = parameters.flag("irradiance_filter", True)
-        self.indirect_aovs = parameters.flag("indirect_aovs", False)
 
     def transport(self, scene, prepared, spp):
         return self.transport_from(

@@ -222,5 +222,8 @@ def secondary(scene, transport, sampler, vertex, u, active):
         )
     end = follow(scene, transport, sampler, start, active & (dr.max(weight) > 0))
     arriving = weight * end.radiance
+    if transport.clamp is not None:
+        largest = dr.max(dr.abs(arriving))
+        arriving *= dr.select(largest > transport.clamp, transport.clamp / largest, 1)
     nearness = dr.rcp(dr.minimum(end.distance, start.ray.maxt))
     return arriving, dr.select(wide, arriving, 0), dr.select(wide, nearness, 0), end.valid

@@ -81,6 +81,7 @@ class Transport:
     cache            irradiance on the patches; None while it is being made, when a path's only end
                      in a patch is recorded
     residual         how the errors of cache and maps are estimated, or None to leave them
+    clamp            largest radiance [W/m²/sr] that a secondary ray may bring, or None
     """
 
     patches: Patches
@@ -94,6 +95,7 @@ class Transport:
     hide_emitters: bool = False
     cache: IrradianceCache | None = None
     residual: Residual | None = None
+    clamp: mi.Float | None = None
 
     def of_sample(self, index: mi.UInt32) -> Transport:
         """The same; each sample of a pixel decides anew where residuals are estimated."""

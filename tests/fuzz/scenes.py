@@ -206,6 +206,7 @@ def parameters(draw, kind: str):
             "secondary_samples": draw(st.sampled_from([1, 1, 3])),
             "residual_probability": draw(st.sampled_from([0.0, 0.0, 0.5, 1.0])),
             "irradiance_filter": draw(st.booleans()),
+            "clamp_indirect": draw(st.sampled_from([0.0, 1e30])),
         }
     if kind == "envmap_hybrid":
         chosen |= {
