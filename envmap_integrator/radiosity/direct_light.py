@@ -107,8 +107,8 @@ def choose_sources(
     rows, n_rows = [], 0
     for group, smallest in _surroundings(points, point[first], patches, n_rays, n):
         lit_here = smallest & (np.bincount(group, n_lit)[group] > 0)
-        used, row_of_cell = np.unique(group[lit_here], return_inverse=True)
-        row[lit_here] = n_rows + row_of_cell
+        used, place = np.unique(group[lit_here], return_inverse=True)
+        row[lit_here] = n_rows + place
         rank = np.full(group.max(initial=0) + 1, -1)
         rank[used] = np.arange(len(used))
         there = rank[group][cell]
