@@ -440,6 +440,15 @@ LIGHT = {
         ),
         enclosed(1e8, 0.7),
     ),
+    "a dim room under a bright sky": Case(
+        lambda: small_room(
+            walls=box(2) | grey(0.9),
+            lamp=lamp(z=1.9, power=1e-6),
+            sky={"type": "constant", "radiance": 100.0},
+            street=look(origin=(0, -8, 4), target=(0, 0, 0)),
+        ),
+        enclosed(1e-6, 0.9),
+    ),
     "64 lamps": Case(many_lamps, ROOM),
     "a textured lamp": Case(textured_lamp, ROOM),
     "light through glass": Case(lambda: behind("thindielectric"), enclosed(1, 0.7), spp=64),

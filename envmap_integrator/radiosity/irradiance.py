@@ -25,7 +25,8 @@ from .surface_points import SurfacePoints
 if TYPE_CHECKING:
     from ..rendering.transport import Transport
 
-#: Relative change of the irradiance at which the solution counts as converged.
+#: Relative change of the irradiance at which the solution counts as converged, on the mean of all
+#: patches: each by its own irradiance, as the sunlit outside of a house says nothing of its rooms.
 TOLERANCE = 1e-5
 #: Bounces that are followed one by one, those between tests of that (each makes the host wait), and
 #: directions that the rest is searched in at a time.
@@ -215,10 +216,10 @@ def _solve(n_patches, patch, direct, escaped, weight, row, samples):
             previous, indirect = indirect, escaped + bounce(direct, indirect)
             if iteration % CHECK_EVERY:
                 continue
-            change = dr.sum(dr.abs(indirect - previous))
-            level = dr.sum(direct + indirect)
-            dr.eval(indirect, change, level)
-            if change[0] <= TOLERANCE * level[0]:
+            level = direct + indirect
+            change = dr.mean(dr.select(level > 0, dr.abs(indirect - previous) / level, 0))
+            dr.eval(indirect, change)
+            if change[0] <= TOLERANCE:
                 break
         else:
             missing = escaped + bounce(direct, indirect) - indirect
@@ -230,12 +231,12 @@ def _solve(n_patches, patch, direct, escaped, weight, row, samples):
 def _all_bounces(bounce, light: mi.Float, scale: mi.Float) -> mi.Float:
     """Sum of ``light`` and what comes of it by all further bounces: GMRES (Saad and Schultz 1986).
 
-    Errors are measured by ``scale``, what each patch has already: else dark rooms beside bright
-    ones would get theirs. Where a solution is less than ``light`` itself, or there is none, the sum
-    is infinite, as patches reflect what they receive, or more by noise: only ``light`` is returned.
+    Errors are measured by ``scale``, what each patch has already, as above. Where a solution is
+    less than ``light`` itself, or there is none, the sum is infinite, as patches reflect what they
+    receive, or more by noise: only ``light`` is returned.
     """
     light, scale = (x.numpy().astype(np.float64) for x in (light, scale))
-    scale = np.maximum(scale, 1e-4 * scale.mean())
+    scale = np.where(scale > 0, scale, 1)  # Nothing comes where nothing has come in many bounces.
     n = len(light)
 
     def remaining(x):

@@ -80,6 +80,20 @@ def test_an_almost_white_furnace(albedo):
     assert_allclose(light.indirect[inside], albedo * light.total[inside], rtol=5e-3)
 
 
+@pytest.mark.parametrize("albedo", [0.9, 0.98])
+def test_a_dim_furnace_beside_a_bright_one(albedo):
+    """What is left out when the solver stops is little for either."""
+    dim = box(1) | grey(albedo) | emitting(1e-8)
+    bright = box(1) | grey(0.5) | emitting(1e4)
+    bright["to_world"] = at(4, 0, 0) @ bright["to_world"]
+    light = received(coarse_mesh(scene_of(dim, bright), BUDGET))
+    for centre, expected in ((0, 1e-8 / (1 - albedo)), (4, 1e4 / 0.5)):
+        position = light.position - (centre, 0, 0)
+        inside = np.all(np.abs(position) < 1.5, axis=1)
+        inside &= (position * light.normal).sum(axis=1) < 0
+        assert_allclose(light.total[inside], np.pi * expected, rtol=0.02)
+
+
 def test_a_furnace_that_loses_nothing():
     """It has no finite solution: the light of some bounces is what it gets."""
     light = received(coarse_mesh(scene_of(box(1) | grey(1.0) | emitting(0.5)), BUDGET))
