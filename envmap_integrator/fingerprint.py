@@ -32,27 +32,26 @@ class SceneFingerprint:
         arrays, scalars = _parameters(scene)
         indices = tuple(_index(array) for array in arrays)
         if indices != self._indices or scalars != self._scalars or not self._hash:
-            unique = dict(zip(indices, arrays, strict=True))  # Shapes share materials and textures.
-            with ThreadPoolExecutor() as pool:
-                parts = {index: pool.map(_digest, _blocks(unique[index])) for index in unique}
-            digests = {index: b"".join(parts[index]) for index in unique}
             digest = hashlib.blake2b(scalars.encode(), digest_size=16)
-            for index in indices:
-                digest.update(digests[index])
+            known: dict[tuple, bytes] = {}
+            with ThreadPoolExecutor() as pool:
+                for array, index in zip(arrays, indices, strict=True):
+                    if index not in known:  # Shapes share materials and textures.
+                        known[index] = _digest(array, pool)
+                    digest.update(known[index])
             # Holding on to the arrays keeps Dr.Jit from giving their indices to others.
             self._arrays, self._indices, self._scalars = arrays, indices, scalars
             self._hash = digest.hexdigest()
         return self._hash
 
 
-def _blocks(array) -> list[np.ndarray]:
-    """The content of an array, in pieces for several threads."""
+def _digest(array, pool: ThreadPoolExecutor) -> bytes:
+    """Hashes of an array's content, block by block: by several threads if there are several."""
     data = np.ascontiguousarray(array.numpy()).reshape(-1).view(np.uint8)
-    return [data[begin : begin + BLOCK] for begin in range(0, len(data), BLOCK)]
-
-
-def _digest(data: np.ndarray) -> bytes:
-    return hashlib.blake2b(data, digest_size=16).digest()
+    blocks = [data[begin : begin + BLOCK] for begin in range(0, len(data), BLOCK)]
+    # Handing a small array to a thread takes ten times as long as hashing it.
+    each = pool.map if len(blocks) > 1 else map
+    return b"".join(each(lambda block: hashlib.blake2b(block, digest_size=16).digest(), blocks))
 
 
 def _parameters(scene: mi.Scene) -> tuple[tuple, str]:
