@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -12,7 +12,7 @@ from ..jit import upload, upload_vectors
 from ..rendering.ray_counts import Ray, count
 from ..rendering.source_choice import Emitters, SourceChoice, alias_tables, by_weight
 from .patch_points import PatchPoints
-from .patches import Patches, normal_direction
+from .patches import Patches, cell_keys, normal_direction
 from .surface_points import SurfacePoints
 
 #: Shadow rays per patch.
@@ -105,10 +105,13 @@ def choose_sources(
     # ---- A row for the smallest surroundings of each cell that rays enough left from ----
     row = np.full(len(cells), -1)
     rows, n_rows = [], 0
-    for group, smallest in _surroundings(points, point[first], patches, n_rays, n):
-        lit_here = smallest & (np.bincount(group, n_lit)[group] > 0)
-        used, place = np.unique(group[lit_here], return_inverse=True)
-        row[lit_here] = n_rows + place
+    waiting = np.ones(len(cells), dtype=bool)
+    for group in _surroundings(points, point[first], patches):
+        informed = np.bincount(group, n_rays)[group] >= RAYS_PER_EMITTER * n
+        new = waiting & informed & (np.bincount(group, n_lit)[group] > 0)
+        waiting &= ~informed
+        used, place = np.unique(group[new], return_inverse=True)
+        row[new] = n_rows + place
         rank = np.full(group.max(initial=0) + 1, -1)
         rank[used] = np.arange(len(used))
         there = rank[group][cell]
@@ -116,6 +119,8 @@ def choose_sources(
         found = np.bincount(slot, lit_square[there >= 0], len(used) * n)
         rows.append(found.reshape(-1, n))
         n_rows += len(used)
+        if not waiting.any():
+            break
     # The last row is for the rest, and for the empty slots of the cells' hash table.
     rows.append(np.bincount(emitter, square, n)[None])
     row_of_cell = np.full(dr.width(patches.levels), n_rows)
@@ -128,27 +133,21 @@ def choose_sources(
     return SourceChoice(emitters, table, upload(mi.UInt32, row_of_cell))
 
 
-def _surroundings(points, index, patches, n_rays, n_emitters):
-    """Ever larger groups of the C cells, until each is in one that rays enough left from.
+def _surroundings(points: SurfacePoints, index: np.ndarray, patches: Patches):
+    """Ever larger groups of cells, of which ``index`` gives a surface point of each.
 
     First each cell is its own group; then those that face the same way in cubes of twice the edge,
-    four times … ``index`` gives a surface point of each cell. Yields ``(group, smallest)``: the
-    group [C] of each cell, and whether it's the smallest that will do.
+    four times … Yields the group [C] of each cell.
     """
-    enough = RAYS_PER_EMITTER * n_emitters
-    position = points.position[index] - patches.origin.numpy().ravel()
-    facing = normal_direction(upload_vectors(mi.Normal3f, points.normal[index])).numpy()
-    group, size = np.arange(len(index)), patches.size[0]
-    waiting = np.ones(len(index), dtype=bool)
-    while True:
-        informed = np.bincount(group, n_rays)[group] >= enough
-        yield group, waiting & informed
-        waiting &= ~informed
-        if size > points.extent or not waiting.any():
-            return
+    yield np.arange(len(index))
+    position = upload_vectors(mi.Point3f, points.position[index])
+    facing = normal_direction(upload_vectors(mi.Normal3f, points.normal[index]))
+    size = patches.size[0]
+    while size <= points.extent:
         size *= 2
-        cube = np.floor(position / size).astype(np.int64)
-        group = np.unique(np.c_[facing, cube], axis=0, return_inverse=True)[1].ravel()
+        coarser = replace(patches, size=dr.opaque(mi.Float, size))
+        keys = cell_keys(coarser, position, facing, mi.UInt32(0))
+        yield np.unique(keys, return_inverse=True)[1]
 
 
 def sample_irradiance(scene, choice, si, row, u):

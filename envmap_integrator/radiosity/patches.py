@@ -168,7 +168,7 @@ def build_patches(
             use_objects=object_ids.count * 8 <= budget,
         )
         identity = patches._identity(normal, object_id)
-        key = _keys(patches, position, identity, mi.UInt32(0))
+        key = cell_keys(patches, position, identity, mi.UInt32(0))
         large, cell_of_point, n_points = np.unique(key, return_inverse=True, return_counts=True)
         # Six directions of a hundred small objects may share the smallest grid there is.
         if len(large) <= max(budget // 2, 8) or size > 4 * extent:
@@ -184,7 +184,7 @@ def build_patches(
 
     # ---- Their cells are the patches ----
     level_of_point = upload(mi.UInt32, level[cell_of_point])
-    key = _keys(patches, position, identity, level_of_point)
+    key = cell_keys(patches, position, identity, level_of_point)
     cells, cell_of_point = np.unique(key, return_inverse=True)
     cells, patch_of_cell = _hash_table(cells)
     patches = replace(patches, levels=upload(mi.UInt32, levels), cells=upload(mi.UInt32, cells))
@@ -210,7 +210,7 @@ def _no_patches() -> Patches:
     return Patches(origin, size, levels=bucket, cells=mi.UInt32(bucket), use_objects=False)
 
 
-def _keys(patches: Patches, position, identity, level) -> np.ndarray:
+def cell_keys(patches: Patches, position, identity, level) -> np.ndarray:
     """Slot and fingerprint [N] of the cells of points, in one word."""
     scale = mi.Float(mi.UInt32(1) << level) / patches.size
     cell = mi.Vector3i(dr.floor((position - patches.origin) * scale))
