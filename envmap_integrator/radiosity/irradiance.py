@@ -208,7 +208,7 @@ def _solve(n_patches, patch, direct, escaped, weight, row, samples):
         store(direct, indirect)
         arriving = weight * dr.gather(mi.Spectrum, table, row)
         dr.eval(arriving)  # Once, not for every block sum.
-        return dr.ravel(type(weight)(*(dr.block_sum(c, samples) / samples for c in arriving)))
+        return dr.ravel(mi.Spectrum(*(dr.block_sum(c, samples) / samples for c in arriving)))
 
     indirect = mi.Float(escaped)
     with stage("Solving irradiance"):
@@ -231,9 +231,9 @@ def _solve(n_patches, patch, direct, escaped, weight, row, samples):
 def _all_bounces(bounce, light: mi.Float, scale: mi.Float) -> mi.Float:
     """Sum of ``light`` and what comes of it by all further bounces: GMRES (Saad and Schultz 1986).
 
-    Errors are measured by ``scale``, what each patch has already, as above. Where a solution is
-    less than ``light`` itself, or there is none, the sum is infinite, as patches reflect what they
-    receive, or more by noise: only ``light`` is returned.
+    Errors are measured by ``scale``, the indirect light that each patch has already. Where a
+    solution is less than ``light`` itself, or there is none, the sum is infinite, as patches
+    reflect what they receive, or more by noise: only ``light`` is returned.
     """
     light, scale = (x.numpy().astype(np.float64) for x in (light, scale))
     scale = np.where(scale > 0, scale, 1)  # Nothing comes where nothing has come in many bounces.

@@ -56,12 +56,16 @@ def patch_means(coarse: CoarseMesh, values: np.ndarray) -> np.ndarray:
     return np.stack(sums, axis=1) / n_points[:, None]
 
 
+def in_furnace(albedo: float) -> tuple[Received, np.ndarray]:
+    """What patches of a box receive whose walls emit 0.5, and which of them face inwards."""
+    light = received(coarse_mesh(scene_of(box(1) | grey(albedo) | emitting(0.5)), BUDGET))
+    return light, (light.position * light.normal).sum(axis=1) < 0
+
+
 @pytest.mark.parametrize("albedo", [0.0, 0.2, 0.5, 0.8])
 def test_a_furnace(albedo):
     """Walls that emit L and reflect ρ receive π L / (1 - ρ), ρ of it indirectly."""
-    walls = box(1) | grey(albedo) | emitting(0.5)
-    light = received(coarse_mesh(scene_of(walls), BUDGET))
-    inside = (light.position * light.normal).sum(axis=1) < 0
+    light, inside = in_furnace(albedo)
     total, indirect = light.total[inside, 0], light.indirect[inside, 0]
     expected = np.pi * 0.5 / (1 - albedo)
     # Each bounce passes on what the solver has left out when it stopped.
@@ -74,8 +78,7 @@ def test_a_furnace(albedo):
 @pytest.mark.parametrize("albedo", [0.9, 0.99, 0.999])
 def test_an_almost_white_furnace(albedo):
     """Hundreds of bounces count there. Each repeats the error of the one before."""
-    light = received(coarse_mesh(scene_of(box(1) | grey(albedo) | emitting(0.5)), BUDGET))
-    inside = (light.position * light.normal).sum(axis=1) < 0
+    light, inside = in_furnace(albedo)
     assert_allclose(light.total[inside], np.pi * 0.5 / (1 - albedo), rtol=5e-3)
     assert_allclose(light.indirect[inside], albedo * light.total[inside], rtol=5e-3)
 
@@ -96,8 +99,7 @@ def test_a_dim_furnace_beside_a_bright_one(albedo):
 
 def test_a_furnace_that_loses_nothing():
     """It has no finite solution: the light of some bounces is what it gets."""
-    light = received(coarse_mesh(scene_of(box(1) | grey(1.0) | emitting(0.5)), BUDGET))
-    inside = (light.position * light.normal).sum(axis=1) < 0
+    light, inside = in_furnace(1.0)
     assert_allclose(light.total[inside], np.pi * 0.5 * (MAX_BOUNCES + 2), rtol=0.01)
 
 

@@ -53,9 +53,12 @@ def lamp_at(x: float, power: float = 1.0, **more) -> dict:
 @pytest.fixture(scope="module")
 def hall(variant) -> CoarseMesh:
     """A long floor with a lamp over each end, one in the middle and one that is off."""
+    return hall_with(lamp_at(-7), lamp_at(0, 4.0), lamp_at(7), lamp_at(3, 0.0), budget=1024)
+
+
+def hall_with(*lamps: dict, budget: int) -> CoarseMesh:
     floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([8, 1, 1])} | grey(0.5)
-    scene = scene_of(floor, lamp_at(-7), lamp_at(0, 4.0), lamp_at(7), lamp_at(3, 0.0))
-    return coarse_mesh(scene, budget=1024, points_per_patch=64)
+    return coarse_mesh(scene_of(floor, *lamps), budget, points_per_patch=64)
 
 
 @pytest.fixture(scope="module")
@@ -149,9 +152,7 @@ def test_rows_are_for_cells_that_are_lit(choice):
 def test_many_lamps_are_told_apart():
     """Where the shadow rays of a cell are too few for that, those of its surroundings help."""
     random = np.random.default_rng(5)
-    lamps = [lamp_at(x) for x in random.uniform(-7.5, 7.5, 150)]
-    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([8, 1, 1])} | grey(0.5)
-    hall = coarse_mesh(scene_of(floor, *lamps), budget=512, points_per_patch=64)
+    hall = hall_with(*map(lamp_at, random.uniform(-7.5, 7.5, 150)), budget=512)
     choice = choice_in(hall)
     n_emitters = choice.emitters.count
     n_rows = len(choice.table.numpy()) // (4 * n_emitters)
