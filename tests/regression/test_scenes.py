@@ -53,6 +53,12 @@ def test_many_lamps(tmp_path, scattered):
     assert_like_path(load_scene(path, WIDTH, HEIGHT), allowed=0.01)
 
 
+def test_sunlit(tmp_path):
+    made_by("make_sunlit.py", "--metals", "steel", "--out", tmp_path)
+    (path,) = tmp_path.iterdir()
+    assert_like_path(load_scene(path, WIDTH, HEIGHT), precision=0.05)
+
+
 def made_by(script: str, *arguments) -> None:
     subprocess.run([*map(str, (sys.executable, SCENES / script, *arguments))], check=True)
 
