@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import mitsuba as mi
 import numpy as np
 import pytest
+from scipy.ndimage import convolve, median_filter
 
 from compare.metrics import error_floor, rel_mse
 from envmap_integrator.denoiser import denoise
 from envmap_integrator.rendering import film as film_module
 from tests.helpers import (
+    SCENES,
     at,
     box,
     camera,
@@ -18,6 +23,7 @@ from tests.helpers import (
     grey,
     integrator,
     load,
+    load_scene,
     picture,
     room,
     scaled,
@@ -141,6 +147,47 @@ class TestFilms:
         ours.render(scene, spp=4, develop=False)
         later = np.array(scene.sensors()[0].film().develop())
         np.testing.assert_array_equal(later, picture(scene, ours, 4))
+
+
+# ---------------------- Rare bright samples ----------------------
+
+
+@pytest.mark.parametrize("metal", ["steel", "paint"])
+def test_sunlit_room(variant, tmp_path, metal):
+    """With and without caustics: less error, the same light, and no disc around bright samples."""
+    make = [sys.executable, SCENES / "make_sunlit.py", "--out", tmp_path]
+    subprocess.run([*map(str, make)], check=True)
+    scene = load_scene(tmp_path / f"sunlit-{metal}.xml", 240, 180)
+    ours = integrator(
+        "one_level_path", sampler="coherent", irradiance_filter=True, indirect_aovs=True
+    )
+    shared, apart, contrasts = [], [], []
+    for seed in range(4):
+        channels = np.array(mi.render(scene, integrator=ours, spp=16, seed=seed))
+        indirect, gathered, albedo = np.split(channels[..., -9:], 3, axis=2)
+        shared.append(channels[..., :3])
+        apart.append(channels[..., :3] - indirect + gathered)
+        contrasts.extend(around_outliers(indirect, gathered, albedo))
+    errors = [rel_mse(some[0], apart[1:]) for some in (shared, apart)]
+    assert errors[0] < errors[1] / 4
+    assert np.mean(shared) == pytest.approx(np.mean(apart), rel=0.005)
+    if metal == "steel":
+        assert len(contrasts) > 10
+        assert np.median(contrasts) < 1.8  # 2.4 if all of the excess is shared
+
+
+def around_outliers(indirect, gathered, albedo):
+    """How many times as bright sharing makes the eight pixels around each outlier."""
+    lit = albedo.min(axis=2) > 0
+    shared, apart = (
+        np.where(lit, x.sum(axis=2) / np.where(lit, albedo.sum(axis=2), 1), 0)
+        for x in (indirect, gathered)
+    )
+    usual = median_filter(apart, 9)
+    outlier = (usual > 0) & (apart > 20 * usual)
+    around = np.ones((3, 3)) / 8
+    around[1, 1] = 0
+    return convolve(shared, around)[outlier] / convolve(apart, around)[outlier]
 
 
 def test_too_many_samples_for_a_sampler_of_mitsuba(variant, monkeypatch):

@@ -21,7 +21,7 @@ pytestmark = [
     pytest.mark.variants("llvm_ad_rgb", "llvm_ad_mono"),
 ]
 
-HEIGHT, WIDTH = 24, 32
+HEIGHT, WIDTH = 90, 100
 ALLOWED = tolerance(64)
 Y, X = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)
 
@@ -60,13 +60,19 @@ def test_textures_stay_as_they_are():
     np.testing.assert_allclose(filtered(3.0, albedo), 3 * albedo, rtol=1e-5)
 
 
-def test_noise_falls_by_the_number_of_pixels_that_share():
-    noise = np.random.default_rng(1).uniform(0, 2, (HEIGHT, WIDTH))
-    inner = np.s_[RADIUS:-RADIUS, RADIUS:-RADIUS]
-    result = filtered(noise, nearness=1e-6)[inner] / 0.5
+def variance_of_equal_sharing() -> float:
+    """Of a pixel, over that of one that shares nothing, where all pixels may share."""
     dy, dx = np.mgrid[-RADIUS : RADIUS + 1, -RADIUS : RADIUS + 1]
     taper = np.maximum(1 - (dx**2 + dy**2) / (RADIUS + 1) ** 2, 0)
-    expected = (taper**2).sum() / taper.sum() ** 2
+    return (taper**2).sum() / taper.sum() ** 2
+
+
+@pytest.mark.parametrize("distribution", ["uniform", "exponential"])
+def test_noise_falls_by_the_number_of_pixels_that_share(distribution):
+    noise = getattr(np.random.default_rng(1), distribution)(size=(HEIGHT, WIDTH))
+    inner = np.s_[RADIUS:-RADIUS, RADIUS:-RADIUS]
+    result = filtered(noise, nearness=1e-6)[inner] / 0.5
+    expected = variance_of_equal_sharing()
     assert expected < 1 / 25
     assert result.var() / noise.var() == pytest.approx(expected, rel=0.3)
 
@@ -111,3 +117,58 @@ def test_what_is_not_finite_stays_where_it_is():
 def test_less_is_allowed_for_as_samples_grow():
     allowed = np.array([tolerance(n) for n in (1, 16, 64, 4096, 1 << 24)])
     assert (np.diff(allowed) < 0).all() and allowed[-1] < 0.05
+
+
+# ---------------------- Outliers ----------------------
+
+CENTRE = (HEIGHT // 2, WIDTH // 2)
+
+
+@pytest.mark.parametrize("brightness", [10, 100, 1e4, 1e8])
+def test_an_outlier_is_not_seen_around_it(brightness):
+    """Without a limit its neighbours would get a fortieth of it; none of its light is lost."""
+    irradiance = np.ones((HEIGHT, WIDTH))
+    irradiance[CENTRE] = brightness
+    result = filtered(irradiance, nearness=1e-6) / 0.5
+    assert np.delete(result, np.ravel_multi_index(CENTRE, result.shape)).max() < 1.4
+    assert result.sum() == pytest.approx(irradiance.sum(), rel=1e-4)
+
+
+def test_some_outliers_do_not_justify_each_other():
+    irradiance = np.ones((HEIGHT, WIDTH))
+    outliers = [(40, 50), (42, 50), (41, 53)]
+    for place in outliers:
+        irradiance[place] = 100
+    result = filtered(irradiance, nearness=1e-6) / 0.5
+    assert result.max() < 2
+    assert result.sum() == pytest.approx(irradiance.sum(), rel=1e-4)
+
+
+def test_an_outlier_is_not_seen_around_a_corner():
+    normal = np.where(X[..., None] < 52, (0, 0, 1), (-1, 0, 0))
+    irradiance = np.ones((HEIGHT, WIDTH))
+    irradiance[CENTRE] = 100
+    result = filtered(irradiance, normal=normal, nearness=1e-6) / 0.5
+    np.testing.assert_allclose(result[:, 52:], 1, rtol=1e-4)
+
+
+def test_what_many_have_found_is_shared():
+    """A bright line one pixel wide: as many as it has in reach share its noise."""
+    noise = 100 * np.random.default_rng(3).uniform(0.5, 1.5, HEIGHT)
+    irradiance = np.ones((HEIGHT, WIDTH))
+    irradiance[:, CENTRE[1]] = noise
+    result = filtered(irradiance, nearness=1e-6)[RADIUS:-RADIUS] / 0.5
+    taper = 1 - np.arange(-RADIUS, RADIUS + 1) ** 2 / (RADIUS + 1) ** 2
+    expected = np.convolve(noise, taper / taper.sum(), "valid")
+    beside, on = result[:, CENTRE[1] + 1], result[:, CENTRE[1]]
+    assert np.corrcoef(on, expected)[0, 1] > 0.99
+    assert beside.mean() > 0.9 * on.mean() > 10
+
+
+def test_light_that_few_find_is_shared():
+    """Where three in a hundred samples meet it, four a pixel: most neighbours are black."""
+    found = np.random.default_rng(4).binomial(4, 0.03, (HEIGHT, WIDTH))
+    inner = np.s_[RADIUS:-RADIUS, RADIUS:-RADIUS]
+    result = filtered(found, nearness=1e-6)[inner] / 0.5
+    assert result.var() / found.var() < 1.6 * variance_of_equal_sharing()
+    assert result.mean() == pytest.approx(found.mean(), rel=0.03)
