@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .fingerprint import difference
 from .jit import opaque_point, upload
 from .maps.clusters import (
     ClusterRequest,
@@ -304,7 +305,8 @@ def _difference(theirs: str, ours: str) -> str:
         return ""
     (scene, settings), (our_scene, our_settings) = (k.partition(" ")[::2] for k in (theirs, ours))
     if scene != our_scene:
-        return "made for another scene or variant"
+        differing = difference(scene, our_scene)
+        return "made for another scene" + (f": it has other {differing}" if differing else "")
     last = len(fields(Settings)) - 1
     each = (text.split(", ", last) for text in (settings, our_settings))
     pairs = ((a, b) for a, b in zip(*each, strict=False) if a != b)

@@ -164,7 +164,11 @@ def test_damaged_files(saved, tmp_path, damage, message, reader):
 @pytest.mark.parametrize(
     ("scene", "settings", "message"),
     [
-        (lambda: room(ball=None, block=None, cup=ball(0, 0, 0, 1)), {}, "another scene or variant"),
+        (
+            lambda: room(ball=None, block=None, cup=ball(0, 0, 0, 1)),
+            {},
+            "made for another scene: it has other shapes",
+        ),
         (room, {"patches": 999}, f"made with patches={PATCHES}, not patches=999"),
         (room, {"map_resolution": 8}, "made with map_resolution=64, not map_resolution=8"),
     ],
