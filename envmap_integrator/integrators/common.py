@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 
 from ..checks import check_scene, check_variant
-from ..fingerprint import SceneFingerprint
+from ..fingerprint import SceneContent, SceneFingerprint
 from ..interrupt import interruptible
 from ..parameters import Parameters
 from ..pipeline import Prepared, Settings, load, prepare
@@ -26,6 +28,19 @@ SAMPLERS = (
     "orthogonal",
     "scene",
 )
+
+
+@dataclass(frozen=True)
+class SceneObjects:
+    """How kernels tell the objects of a scene apart, and the content for which that holds.
+
+    Other scenes of the same content have other objects, and shapes that move change places. Holding
+    on to the scene, which holds its integrator, would keep both alive for ever.
+    """
+
+    content: SceneContent
+    ids: ObjectIds
+    emitters: Emitters
 
 
 class CachedIntegrator(mi.SamplingIntegrator):
@@ -58,9 +73,9 @@ class CachedIntegrator(mi.SamplingIntegrator):
         self.sampler = parameters.choice("sampler", "coherent", SAMPLERS)
         self.cache_file = parameters.text("cache_file")
         self._fingerprint = SceneFingerprint()
-        self._key = ""
+        self._made_for = ("", "")
         self._prepared: dict[Settings, Prepared] = {}
-        self._scene_ids: tuple | None = None
+        self._objects: SceneObjects | None = None
         self._seed = 0
 
     # ---------------------- To be overridden ----------------------
@@ -100,9 +115,9 @@ class CachedIntegrator(mi.SamplingIntegrator):
         """
         settings = self.settings()
         key = f"{self._fingerprint(scene)} {settings}"
-        if key != self._key:
+        if (key, self.cache_file) != self._made_for:
             check_scene(scene, self.owner)
-            self._key, self._prepared = key, {}
+            self._made_for, self._prepared = (key, self.cache_file), {}
         if not self.cache_file:
             settings = settings.for_render(_camera_samples(scene, sensor, spp))
         if settings not in self._prepared:
@@ -115,18 +130,20 @@ class CachedIntegrator(mi.SamplingIntegrator):
         with interruptible(), dr.suspend_grad():
             return prepare(scene, key, settings, self.owner, self.bake_with())
 
+    def objects_of(self, scene: mi.Scene) -> SceneObjects:
+        """The same record as long as nothing in the scene changes."""
+        content = SceneContent(scene)
+        if self._objects is None or self._objects.content != content:
+            self._objects = SceneObjects(content, ObjectIds(scene), Emitters(scene))
+        return self._objects
+
     def transport_from(self, scene: mi.Scene, prepared: Prepared, **more) -> Transport:
         """A ``Transport`` with all that is the same for all integrators."""
-        # Other scenes of the same content have other ids. Holding on to the scene, which holds this
-        # integrator, would keep both alive for ever.
-        key = dr.reinterpret_array(mi.UInt32, scene.shapes_dr()).numpy().tobytes()
-        if self._scene_ids is None or self._scene_ids[0] != key:
-            self._scene_ids = key, ObjectIds(scene), Emitters(scene)
-        _, object_ids, emitters = self._scene_ids
+        objects = self.objects_of(scene)
         return Transport(
             prepared.cache.patches,
-            object_ids,
-            SourceChoice(emitters, prepared.sources, prepared.source_rows),
+            objects.ids,
+            SourceChoice(objects.emitters, prepared.sources, prepared.source_rows),
             cache=prepared.cache,
             shadow_samples=self.shadow_samples,
             clamp=dr.opaque(mi.Float, self.clamp_indirect) if self.clamp_indirect else None,

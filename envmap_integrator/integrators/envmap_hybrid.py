@@ -178,19 +178,21 @@ class EnvmapHybrid(GatheringIntegrator):
 
     def _far_field_of(self, scene, prepared, spp) -> FarField | None:
         """The maps where kernels read them, uploaded once for a prepared state and sample count."""
-        key = (id(scene), id(prepared), spp)
+        if not prepared.maps:
+            return None
+        held = self.objects_of(scene), prepared
+        numbers = spp * self.secondary_samples, self.mip_bias, self.lookup, self.mirrors
+        key = (*map(id, held), *numbers)
         if self._far_field is None or self._far_field[0] != key:
-            n_samples = spp * self.secondary_samples
-            self._far_field = (
-                key,
-                far_field(
-                    scene,
-                    prepared.maps,
-                    prepared.cluster_of_cell,
-                    n_samples,
-                    self.mip_bias,
-                    corrected=self.lookup == "corrected",
-                    map_mirrors=self.mirrors == "map",
-                ),
+            found = far_field(
+                scene,
+                prepared.maps,
+                prepared.cluster_of_cell,
+                spp * self.secondary_samples,
+                self.mip_bias,
+                corrected=self.lookup == "corrected",
+                map_mirrors=self.mirrors == "map",
             )
+            # Nothing else gets the address of what is held on to.
+            self._far_field = key, found, held
         return self._far_field[1]
