@@ -22,6 +22,15 @@ def check_variant(plugin: str) -> None:
         ensure_llvm()
 
 
+def check_not_frozen(plugin: str) -> None:
+    """Raise ``RuntimeError`` while ``dr.freeze`` records: it can't record what runs on the host."""
+    if dr.flag(dr.JitFlag.FreezingScope):
+        raise RuntimeError(
+            f"{plugin}: can't be recorded by dr.freeze; render outside of the frozen function, or "
+            "use path"
+        )
+
+
 def check_scene(scene: mi.Scene, owner: str) -> None:
     """Stop at scenes that would render black or wrong.
 

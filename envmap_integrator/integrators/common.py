@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..checks import check_scene, check_variant
+from ..checks import check_not_frozen, check_scene, check_variant
 from ..fingerprint import SceneContent, SceneFingerprint
 from ..interrupt import interruptible
 from ..parameters import Parameters
@@ -113,6 +113,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
         Raises ``ValueError`` for scenes that can't be rendered and for a ``cache_file`` that is
         missing, damaged, or of another scene or other settings.
         """
+        check_not_frozen(self.owner)
         settings = self.settings()
         key = f"{self._fingerprint(scene)} {settings}"
         if (key, self.cache_file) != self._made_for:
@@ -186,6 +187,18 @@ class CachedIntegrator(mi.SamplingIntegrator):
                 dr.eval(picture)
         return picture
 
+    def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+        self._refuse_gradients()
+
+    def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+        self._refuse_gradients()
+
+    def _refuse_gradients(self):
+        """The cache is made without gradients: they would lack most of the light."""
+        raise NotImplementedError(
+            f"{self.owner}: can't be differentiated; use prb for gradients, or render without them"
+        )
+
     def _pixel_sampler(self, sensor: mi.Sensor, spp: int) -> tuple[mi.Sampler | None, int]:
         """A sampler of Mitsuba's, None for our own points, and its samples per pixel.
 
@@ -209,6 +222,8 @@ class CachedIntegrator(mi.SamplingIntegrator):
     def sample(self, scene, sampler, ray, medium=None, active=True):
         transport = self.transport(scene, self.prepare(scene), sampler.sample_count())
         found = self.radiance(scene, transport, sampler, ray, active)
+        if dr.grad_enabled(found.radiance):
+            self._refuse_gradients()
         return found.radiance, found.valid, self.aovs(found)
 
     def aov_names(self) -> list[str]:

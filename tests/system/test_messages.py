@@ -21,7 +21,7 @@ import envmap_integrator
 from compare.hard_cases import empty_mesh
 from envmap_integrator import memory, storage
 from envmap_integrator.atomic import check_writable, replacing
-from envmap_integrator.checks import check_scene, check_variant
+from envmap_integrator.checks import check_not_frozen, check_scene, check_variant
 from envmap_integrator.cli import commands
 from envmap_integrator.cli.scene_file import SceneFile, parse_assignment
 from envmap_integrator.denoiser import warm_up
@@ -97,6 +97,15 @@ def emitter(**parameters: object) -> Callable:
         {"type": "mipmap_cube", "id": "sky"}
         | {key: str(v(s)) if key == "filename" else v for key, v in parameters.items()}
     )
+
+
+def frozen(_: Surroundings) -> None:
+    with dr.scoped_set_flag(dr.JitFlag.FreezingScope, True):
+        check_not_frozen("envmap_hybrid")
+
+
+def differentiated(_: Surroundings) -> None:
+    integrator("envmap_hybrid").render_backward(load(room()), None, None)
 
 
 def listed(*shapes: str) -> Callable:
@@ -291,6 +300,9 @@ CASES = {
     ),
     "unknown shape": Case(listed("bal"), 'mipmap_cube "desk"', '"bal"', "optimize=False"),
     "listed twice": Case(listed("ball", "ball"), '"desk"', '"ball" is listed twice', "list it "),
+    # ---- What else isn't done ----
+    "frozen": Case(frozen, "envmap_hybrid", "dr.freeze", "render outside of the frozen function"),
+    "gradients": Case(differentiated, "envmap_hybrid", "can't be differentiated", "use prb for"),
     # ---- The machine ----
     "variant": Case(other_variant, "envmap_hybrid", "variant scalar_rgb", "use one of llvm_ad_rgb"),
     "llvm": Case(old_llvm, "llvm_* variants", "LLVM 15", "need LLVM 17 or newer: "),
