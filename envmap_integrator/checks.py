@@ -34,8 +34,9 @@ def check_not_frozen(plugin: str) -> None:
 def check_scene(scene: mi.Scene, owner: str) -> None:
     """Stop at scenes that would render black or wrong.
 
-    Raises ``ValueError`` for scenes without surfaces or emitters, for meshes without faces, which
-    Mitsuba's kernels can't read, and for participating media.
+    Raises ``ValueError`` for scenes without surfaces or emitters, for emitters that only list a
+    cluster, for meshes without faces, which Mitsuba's kernels can't read, and for participating
+    media.
     Media that only absorb, as in tinted glass, are ignored with a warning: ``path``, the reference,
     ignores all media.
     """
@@ -43,6 +44,9 @@ def check_scene(scene: mi.Scene, owner: str) -> None:
         raise ValueError(f"{owner}: the scene has no surfaces; add a shape")
     if not scene.emitters():
         raise ValueError(f"{owner}: the scene has no emitters, all would be black; add one")
+    for emitter in scene.emitters():
+        if getattr(emitter, "request", None) is not None:
+            raise ValueError(f"{owner}: {misplaced(emitter)}")
     for shape in scene.shapes():
         if isinstance(shape, mi.Mesh) and shape.face_count() == 0:
             raise ValueError(f'{owner}: shape "{shape.id()}" is a mesh without faces; remove it')
@@ -67,6 +71,14 @@ def check_scene(scene: mi.Scene, owner: str) -> None:
                 f'{owner}: sensor "{sensor.id()}" lies in a participating medium, which isn\'t '
                 "supported; remove it or use volpath"
             )
+
+
+def misplaced(emitter: mi.Emitter) -> str:
+    """What to do about a ``mipmap_cube`` that lights a scene but has no map."""
+    return (
+        f'mipmap_cube "{emitter.id()}" lists "shapes" and emits nothing; put it inside the '
+        'integrator envmap_hybrid, or give it a "filename"'
+    )
 
 
 def _scatters(medium: mi.Medium) -> bool:

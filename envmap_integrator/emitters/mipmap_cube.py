@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..checks import check_variant
+from ..checks import check_variant, misplaced
 from ..jit import upload
 from ..maps.clusters import ClusterRequest
 from ..maps.cube import direction_to_face, face_to_direction, solid_angles, texel
@@ -64,7 +64,7 @@ class MipmapCube(mi.Emitter):
             if not names:
                 raise ValueError(f'{parameters.owner}: "shapes" must list ids, not {shapes!r}')
             ratio = parameters.number("distance_ratio", None, 1.0)
-            self.request = ClusterRequest(props.id(), names, ratio)
+            self.request, self.level = ClusterRequest(props.id(), names, ratio), 0.0
         else:
             self.request = None
             self.level = parameters.number("level", 0.0, 0.0)
@@ -80,6 +80,7 @@ class MipmapCube(mi.Emitter):
 
     def eval_level(self, direction, level: float, active=True) -> mi.Spectrum:
         """Radiance [W/m²/sr] from world space directions at any level, trilinearly filtered."""
+        self._require_map()
         top = len(self.cube_map.levels) - 1
         level = min(max(level, 0.0), float(top))
         fine = int(level)
@@ -89,6 +90,7 @@ class MipmapCube(mi.Emitter):
         return value
 
     def sample_direction(self, it, sample, active=True):
+        self._require_map()
         index, remapped, _ = self._distribution.sample_reuse_pmf(sample.x, active)
         resolution = self._sampling_resolution
         pixels = resolution * resolution
@@ -119,8 +121,13 @@ class MipmapCube(mi.Emitter):
 
     # ---------------------- Internals ----------------------
 
-    #: Distance [world units] that stands for "far away" in shadow rays.
-    _far = 1e6
+    #: Distance [world units] that stands for "far away" in shadow rays: beyond all scenes, and its
+    #: square is still a number of single precision.
+    _far = 1e15
+
+    def _require_map(self):
+        if self.request is not None:
+            raise RuntimeError(misplaced(self))
 
     def _prepare_evaluation(self):
         texels = self.cube_map.texels()
@@ -141,6 +148,7 @@ class MipmapCube(mi.Emitter):
         self._distribution = mi.DiscreteDistribution(upload(mi.Float, weight))
 
     def _pdf(self, d, active):
+        self._require_map()
         resolution = self._sampling_resolution
         face, uv = direction_to_face(d)
         index = texel(face, uv, mi.UInt32(resolution), mi.UInt32(resolution))

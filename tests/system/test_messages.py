@@ -290,6 +290,11 @@ CASES = {
     ),
     "no emitters": Case(scene(lamp=None), "ours", "the scene has no emitters", "add one"),
     "no faces": Case(faceless, "ours", 'shape "nothing" is a mesh without faces', "remove it"),
+    "cluster": Case(scene(desk=cluster("ball")), '"desk"', 'lists "shapes"', "put it inside the"),
+    "cluster as light": Case(
+        lambda _: mi.load_dict(cluster("ball") | {"id": "desk"}).eval_level(mi.Vector3f(1), 0),
+        '"desk"', "emits nothing", 'or give it a "filename"',
+    ),
     "medium": Case(
         scene(fog=ball(0, 0, 0, 0.3) | {"interior": MEDIUM}),
         'shape "fog"', 'HomogeneousMedium as "interior"', "remove it or use volpath",

@@ -18,7 +18,19 @@ from envmap_integrator.maps.cube import (
 from envmap_integrator.maps.cube_map import CubeMap, from_stored, to_parts
 from envmap_integrator.maps.mipmap import build_levels
 from envmap_integrator.storage import read, write
-from tests.helpers import assert_agree, camera, exactly, grey, load, measure
+from tests.helpers import (
+    assert_agree,
+    camera,
+    cluster,
+    exactly,
+    grey,
+    integrator,
+    load,
+    measure,
+    picture,
+    room,
+    scaled,
+)
 from tests.unit.kit import mean_of
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -293,6 +305,21 @@ def test_the_background_shows_the_map(tmp_path):
     assert_allclose(mi.render(scene, integrator=mi.load_dict(PATH), spp=4).numpy(), 3, rtol=1e-6)
 
 
+@pytest.mark.parametrize("scale", [1e-4, 1.0, 1e4, 1e7, 1e9])
+def test_scenes_of_any_size_hide_and_see_the_map(tmp_path, scale):
+    """Shadow rays to the map end beyond all surfaces, and still point where they should."""
+    sky = {"type": "mipmap_cube", "filename": save(tmp_path / "m.exr", map_of(constant_radiance()))}
+    ball = {"type": "sphere", "radius": scale} | grey(0.6)
+    sensor = camera(width=8, height=8, origin=(0, -3 * scale, 0), target=(0, 0, 0), fov=10)
+    sensor |= {"near_clip": 0.01 * scale, "far_clip": 100 * scale}
+    scene = {"type": "scene", "sensor": sensor, "ball": ball, "sky": sky}
+    direct = mi.load_dict({"type": "direct", "emitter_samples": 1, "bsdf_samples": 0})
+    assert_agree(measure(load(scene), direct, spp=512).overall(), exactly(0.6), precision=0.02)
+
+    walls = {"type": "cube", "to_world": scaled(5 * scale), "flip_normals": True} | grey(0.5)
+    assert not picture(load(scene | {"walls": walls}), direct).any()
+
+
 # ---------------------- Bad parameters ----------------------
 
 
@@ -329,6 +356,15 @@ def test_a_map_of_another_variant_is_refused(tmp_path, other):
     mi.set_variant(other)
     with pytest.raises(RuntimeError, match=f"3 colour channels, variant {other} needs 1"):
         mi.load_dict({"type": "mipmap_cube", "filename": filename})
+
+
+@pytest.mark.parametrize("kind", ["path", "direct", "envmap_hybrid", "source_selection"])
+def test_a_cluster_at_scene_level_is_refused(kind):
+    scene = load(room(desk=cluster("ball")))
+    with pytest.raises(RuntimeError) as raised:
+        picture(scene, integrator(kind))
+    message = 'mipmap_cube "desk" lists "shapes" and emits nothing; put it inside the integrator'
+    assert message in str(raised.value.__cause__)
 
 
 def test_a_cluster_keeps_its_shapes():
