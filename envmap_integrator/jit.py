@@ -38,6 +38,11 @@ def opaque_point(values) -> mi.Point3f:
     return point
 
 
+def mean_channel(colour) -> mi.Float:
+    """Mean of the channels of colours; ``dr.mean`` puts the number of lanes into the kernel."""
+    return dr.sum(colour) / len(colour)
+
+
 def mix(h: mi.UInt32) -> mi.UInt32:
     """Finaliser of MurmurHash3: every input bit affects every output bit."""
     h = (h ^ (h >> 16)) * 0x85EBCA6B

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..jit import upload, upload_vectors
+from ..jit import mean_channel, upload, upload_vectors
 from ..rendering.ray_counts import Ray, count
 from ..rendering.source_choice import Emitters, SourceChoice, alias_tables, by_weight
 from .patch_points import PatchPoints
@@ -61,7 +61,7 @@ def survey_direct_light(
     si = members.sample(dr.arange(mi.UInt32, n) // SAMPLES, sampler.next_1d())
     choice = by_weight(emitters)
     ds, light = sample_irradiance(scene, choice, si, mi.UInt32(0), sampler.next_2d())
-    irradiance = finite(dr.mean(light))
+    irradiance = finite(mean_channel(light))
     emitter = emitters.index(ds.emitter, irradiance > 0)
     dr.eval(irradiance, emitter, si.p)
     return DirectLight(members, irradiance, emitter, si.p)

@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.sparse.linalg import LinearOperator, gmres
 
-from ..jit import give_back, mix, unit, upload
+from ..jit import give_back, mean_channel, mix, unit, upload
 from ..progress import stage
 from .direct_light import finite, sample_irradiance
 from .patch_points import PatchPoints
@@ -169,7 +169,7 @@ def _gather(scene, transport, members, cells, begin, end, samples, seed):
 
 def _second_moment(light, samples) -> mi.Float:
     """Mean over the rays of each patch of the square of what they bring, over all channels."""
-    square = dr.square(dr.mean(light))
+    square = dr.square(mean_channel(light))
     dr.eval(square)
     return dr.block_sum(square, samples) / samples
 
@@ -217,9 +217,9 @@ def _solve(n_patches, patch, direct, escaped, weight, row, samples):
             if iteration % CHECK_EVERY:
                 continue
             level = direct + indirect
-            change = dr.mean(dr.select(level > 0, dr.abs(indirect - previous) / level, 0))
+            change = dr.sum(dr.select(level > 0, dr.abs(indirect - previous) / level, 0))
             dr.eval(indirect, change)
-            if change[0] <= TOLERANCE:
+            if change[0] <= TOLERANCE * dr.width(level):
                 break
         else:
             missing = escaped + bounce(direct, indirect) - indirect

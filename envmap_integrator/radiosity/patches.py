@@ -103,7 +103,8 @@ class Patches:
         scale = mi.Float(mi.UInt32(1) << level) / self.size
         cell = mi.Vector3i(dr.floor((p - self.origin) * scale))
         slot, fingerprint = cell_hash(cell, identity, level)
-        bucket = slot & (dr.width(table) // BUCKET - 1)
+        # As data: tables of other sizes compile nothing.
+        bucket = slot & dr.opaque(mi.UInt32, dr.width(table) // BUCKET - 1)
         entries = dr.gather(mi.Vector4u, table, bucket, active)
         found, index, entry = mi.Bool(False), mi.UInt32(0), mi.UInt32(0)
         for i in range(BUCKET):

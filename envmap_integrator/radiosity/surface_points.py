@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..jit import upload
+from ..jit import opaque_point, upload
 from ..rendering.ray_counts import Ray, count
 from ..scene_order import ordered_shapes
 
@@ -190,7 +190,8 @@ def _global_lines(scene: mi.Scene, sampler: mi.Sampler) -> mi.Ray3f:
     disk = mi.warp.square_to_uniform_disk_concentric(sampler.next_2d())
     frame = mi.Frame3f(direction)
     offset = frame.to_world(mi.Vector3f(disk.x, disk.y, -1.01))
-    return mi.Ray3f(mi.Point3f(sphere.center) + sphere.radius * offset, direction)
+    radius = dr.opaque(mi.Float, sphere.radius)
+    return mi.Ray3f(opaque_point(sphere.center) + radius * offset, direction)
 
 
 @dr.syntax

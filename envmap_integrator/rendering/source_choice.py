@@ -23,6 +23,7 @@ class Emitters:
     """The emitters of a scene, as ``ordered_emitters`` counts them.
 
     count      number of emitters L
+    size       [1]  the same where kernels read it as data: other numbers compile nothing
     pointers   [L]
     weights    [L]  their ``sampling_weight``, in sum 1
     """
@@ -33,6 +34,7 @@ class Emitters:
         self.pointers = mi.EmitterPtr(emitters)
         weights = np.array([emitter.sampling_weight() for emitter in emitters], dtype=np.float64)
         self.weights = weights / max(weights.sum(), 1e-30)
+        self.size = dr.opaque(mi.UInt32, self.count)
         registry_ids = dr.reinterpret_array(mi.UInt32, self.pointers).numpy()
         table = np.zeros(int(registry_ids.max(initial=0)) + 1, dtype=np.uint32)
         table[registry_ids] = np.arange(self.count, dtype=np.uint32)
@@ -70,12 +72,12 @@ class SourceChoice:
 
         Visibility isn't tested.
         """
-        n = self.emitters.count
-        if n == 0:
+        if self.emitters.count == 0:
             return dr.zeros(mi.DirectionSample3f, dr.width(ref)), mi.Spectrum(0)
-        u = mi.Point2f(u)
-        bin_ = dr.minimum(mi.UInt32(u.x * n), n - 1)
-        u.x = u.x * n - mi.Float(bin_)
+        n, u = self.emitters.size, mi.Point2f(u)
+        u.x *= mi.Float(n)
+        bin_ = dr.minimum(mi.UInt32(u.x), n - 1)
+        u.x -= mi.Float(bin_)
         entry = dr.gather(mi.Vector4f, self.table, row * n + bin_, active)
         first = u.x < entry.x
         index = dr.select(first, bin_, mi.UInt32(entry.y))
@@ -89,7 +91,7 @@ class SourceChoice:
 
     def pdf_direction(self, ref, row, ds, active):
         """Density [1/sr] of ``sample_direction``."""
-        n = self.emitters.count
+        n = self.emitters.size
         index = self.emitters.index(ds.emitter, active)
         probability = dr.gather(mi.Float, self.table, 4 * (row * n + index) + 2, active)
         return ds.emitter.pdf_direction(ref, ds, active) * probability

@@ -191,14 +191,16 @@ import envmap_integrator
 import drjit as dr
 import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
-from tests.helpers import cluster, integrator, load, picture, room
+from tests.helpers import ball, box, cluster, grey, integrator, picture, room
 
 dr.set_flag(dr.JitFlag.KernelHistory, True)
-scene = load(room())
 known = set()
 
-def new_kernels(seed=0, spp=16, distance_ratio=1.5, **settings):
+def new_kernels(seed=0, spp=16, distance_ratio=1.5, radius=0.4, half_width=2.0, **settings):
     gc.collect()
+    parts = {"ball": ball(0.4, 0.2, -1.6, radius), "walls": box(half_width) | grey(0.5)}
+    # In parallel, shapes come in another order each time, and virtual calls with them.
+    scene = mi.load_dict(room(**parts), optimize=False, parallel=False)
     desk = cluster("block", "ball", distance_ratio=distance_ratio)
     renderer = integrator("envmap_hybrid", desk=desk, **settings)
     before = len(known)
@@ -208,6 +210,8 @@ def new_kernels(seed=0, spp=16, distance_ratio=1.5, **settings):
     return len(known) - before
 
 changes = [{"seed": 5}, {"spp": 64}, {"spp": 4}, {"distance_ratio": 2.25}, {"mip_bias": 0.5}]
+# Tables of other sizes, too.
+changes += [{"patches": 256}, {"patches": 8192}, {"radius": 0.9}, {"half_width": 5.0}]
 print(json.dumps({"first": new_kernels()} | {str(c): new_kernels(**c) for c in changes}))
 """
 
