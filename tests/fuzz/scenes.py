@@ -1,8 +1,9 @@
 """Random scenes, and what each integrator has to make of them.
 
-A *recipe* is plain JSON, so that a scene that fails can be rendered again. A scene passes if it
-gives a picture that is finite, not negative, no brighter than physics allows and as bright as
-``path``'s, or, where something has been put wrong into it, the documented error.
+A *recipe* is plain JSON, so that a scene that fails can be rendered again. It also says what has
+come before: another scene, another view, another place of a shape. A scene passes if it gives a
+picture that is finite, not negative, no brighter than physics allows and as bright as ``path``'s,
+or, where something has been put wrong into it, the documented error.
 
 ``python -m tests.fuzz.scenes --count 2000`` goes through many, in processes of their own, so that
 one that crashes or hangs is known by its recipe too; ``--repeat RECIPE.json`` renders one again.
@@ -29,6 +30,8 @@ from hypothesis import strategies as st
 
 from compare.scene_kit import BLACK_SKY
 from envmap_integrator.cli.errors import condense
+from tests.fuzz.history import earlier_scene, first_frame, move
+from tests.fuzz.rooms import THICK, room_parts
 from tests.helpers import at, film, grey, scaled
 
 Recipe = dict[str, Any]
@@ -37,6 +40,8 @@ Recipe = dict[str, Any]
 BIAS = {"envmap_hybrid": 0.05, "one_level_path": 0.05, "source_selection": 0.2}
 #: Half width of the interval for the means' difference, in standard errors.
 SIGMAS = 6
+#: And the part of it, in the standard errors that the cache states of itself: where light is rare.
+STATED = 4
 #: Materials that let light straight through.
 SEE_THROUGH = ("mask", "null", "thindielectric")
 #: Films are small: what is fuzzed is scenes.
@@ -94,6 +99,8 @@ MATERIALS: dict[str, dict] = {
     },
     "null": {},
 }
+#: Half of all palettes have rough metal.
+METALS = ("roughconductor", "principled", "plastic", "roughconductor")
 ONE_SIDED = ("diffuse", "conductor", "roughconductor", "plastic", "roughplastic")
 WRAPPERS = ("twosided", "mask", "blendbsdf", "bumpmap", "normalmap", "textured")
 #: Shapes that Mitsuba can't sample as sources.
@@ -102,6 +109,7 @@ SHAPES = ("cube", "sphere", "rectangle", "disk", "cylinder", "triangles", "curve
 
 
 LIGHTS = ("point", "spot", "directional", "constant", "envmap", "sunsky", "area")
+FROM_OUTSIDE = ("directional", "constant", "envmap", "sunsky")
 SENSORS = ("perspective", "perspective", "thinlens", "orthographic")
 
 
@@ -124,7 +132,7 @@ class Palette:
         random = Random(number)
         return cls(
             integrators=(random.choice(tuple(BIAS)),),
-            materials=("diffuse", *random.sample(tuple(MATERIALS), 2)),
+            materials=("diffuse", random.choice(METALS), *random.sample(tuple(MATERIALS), 1)),
             wrappers=(random.choice(WRAPPERS),),
             shapes=tuple(random.sample(SHAPES, 2)),
             lights=tuple(random.sample(LIGHTS, 2)),
@@ -176,7 +184,17 @@ def lights(draw, palette: Palette):
         "power": draw(st.sampled_from([1.0, 0.01, 100.0])),
         "at": draw(points(1.5)),
         "towards": draw(st.sampled_from([[0, 0, -1], [1, 1, -2], [0.1, -1, 0.3]])),
+        "sun": draw(st.sampled_from([[0.3, 0.2, 0.8], [0.2, 0.9, 0.4], [-0.3, 1.0, 0.8]])),
         "seed": draw(st.integers(0, 9)),
+    }
+
+
+@st.composite
+def poses(draw):
+    """Where a sensor is and where it looks."""
+    return {
+        "origin": draw(st.one_of(st.just([0, -1.8, 0.4]), points(1.9))),
+        "target": draw(st.sampled_from([[0, 0.5, -1], [0, 0, 0], [1, 1, -2]])),
     }
 
 
@@ -184,8 +202,7 @@ def lights(draw, palette: Palette):
 def sensors(draw, palette: Palette):
     return {
         "type": draw(st.sampled_from(palette.sensors)),
-        "origin": draw(st.one_of(st.just([0, -1.8, 0.4]), points(1.9))),
-        "target": draw(st.sampled_from([[0, 0.5, -1], [0, 0, 0], [1, 1, -2]])),
+        **draw(poses()),
         "fov": draw(st.sampled_from([40, 80, 120])),
         "crop": draw(st.sampled_from([None, None, [1, 2, 5, 3]])),
     }
@@ -235,15 +252,60 @@ MISTAKES = {
 
 
 @st.composite
+def surroundings(draw, palette: Palette):
+    """The room, its walls and the light."""
+    return {
+        "room": draw(st.sampled_from(["closed", "closed", "open", "none", "gap", "window"])),
+        "gap": draw(logarithmic(0.02, 0.5)),
+        "wall": draw(reals(0.0, WHITEST_WALL)),
+        "bumps": draw(st.one_of(st.none(), st.none(), st.none(), wall_bumps())),
+        "plain": draw(st.sampled_from([False] * 4 + [True])),
+        "lights": draw(st.lists(lights(palette), min_size=1, max_size=3)),
+    }
+
+
+@st.composite
+def wall_bumps(draw):
+    return {
+        "type": draw(st.sampled_from(["bumpmap", "normalmap"])),
+        "height": draw(st.sampled_from([0.1, 0.3, 1.0])),
+        "seed": draw(st.integers(0, 9)),
+    }
+
+
+@st.composite
+def histories(draw, palette: Palette, recipe: Recipe):
+    """What has been before; see ``tests.fuzz.history``.
+
+    before   what another scene had otherwise, which the integrator has rendered before
+    start    where the camera or a shape was when it rendered this one for the first time
+    given    a sensor is passed to ``mi.render``: of a scene that has none, or one elsewhere
+    """
+    before = draw(surroundings(palette))
+    if not recipe["cubes"]:  # They name objects.
+        before["objects"] = draw(st.lists(objects(palette), min_size=1, max_size=2))
+    start: Recipe = {}
+    if draw(st.booleans()):
+        start["camera"] = draw(poses())
+    if not start or draw(st.booleans()):
+        start["object"] = draw(st.integers(0, len(recipe["objects"]) - 1))
+        start["by"] = draw(points(1.5))
+    elsewhere = {"elsewhere": draw(poses())}
+    return {
+        "before": draw(st.sampled_from([None, None, None, before])),
+        "start": draw(st.sampled_from([None, None, start])),
+        "given": draw(st.sampled_from([None, None, {}, elsewhere])),
+    }
+
+
+@st.composite
 def recipes(draw, palette: Palette) -> Recipe:
     kind = draw(st.sampled_from(palette.integrators))
     recipe = {
         "integrator": kind,
         "parameters": draw(parameters(kind)),
-        "room": draw(st.sampled_from(["closed", "closed", "open", "none"])),
-        "wall": draw(reals(0.0, WHITEST_WALL)),
         "objects": draw(st.lists(objects(palette), min_size=1, max_size=4)),
-        "lights": draw(st.lists(lights(palette), min_size=1, max_size=3)),
+        **draw(surroundings(palette)),
         "sensor": draw(sensors(palette)),
         "scale": draw(st.sampled_from([1.0, 1.0, 1.0, 1e-4, 1e-2, 1e3, 1e5])),
         "offset": draw(st.sampled_from([[0, 0, 0], [0, 0, 0], [30, -20, 100]])),
@@ -260,7 +322,30 @@ def recipes(draw, palette: Palette) -> Recipe:
             )
         )
         recipe["baker"] = draw(st.sampled_from([None, {"samples": 4}, {"shadow_samples": 2}]))
-    return recipe
+    _let_light_in(recipe)
+    return recipe | draw(histories(palette, recipe))
+
+
+def _let_light_in(recipe: Recipe) -> None:
+    """Closed rooms aren't dark; where there is a gap or window, all light comes through it."""
+    lights, room = recipe["lights"], recipe["room"]
+    if room in ("gap", "window"):
+        for item in recipe["objects"]:
+            item["radiance"] = None
+    if room == "window":
+        lights[:] = [lights[0] | {"type": "sunsky"}]
+    elif room == "gap":
+        for light in lights:
+            light["at"][0] = _aside(light["at"][0])
+        origin = recipe["sensor"]["origin"]
+        origin[0] = -_aside(origin[0])
+    if room in ("closed", "gap") and all(light["type"] in FROM_OUTSIDE for light in lights):
+        lights[0]["type"] = "area"
+
+
+def _aside(x: float) -> float:
+    """Not in the middle of the room, where its partition is."""
+    return max(abs(x), 5 * THICK)
 
 
 # ---------------------- Recipe → scene ----------------------
@@ -269,18 +354,18 @@ def recipes(draw, palette: Palette) -> Recipe:
 def scene_of(recipe: Recipe) -> dict:
     """What ``mi.load_dict`` makes the scene of."""
     place = at(*(recipe["scale"] * c for c in recipe["offset"])) @ scaled(recipe["scale"])
-    parts: dict[str, Any] = {"type": "scene", "sensor": _sensor(recipe)}
-    wall = grey(recipe["wall"])
+    parts: dict[str, Any] = {"type": "scene"}
+    if recipe["given"] is None:
+        parts["sensor"] = sensor_of(recipe)
+    elif "elsewhere" in recipe["given"]:
+        parts["sensor"] = sensor_of(
+            recipe | {"sensor": recipe["sensor"] | recipe["given"]["elsewhere"]}
+        )
     if recipe["mistake"] == "surfaces":
         return parts | {"sky": {"type": "constant"}}
-    if recipe["room"] == "closed":
-        cube = {"type": "cube", "flip_normals": True}
-        parts["walls"] = cube | {"to_world": place @ scaled(2)} | wall
-    elif recipe["room"] == "open":
-        floor = {"type": "rectangle", "to_world": place @ at(0, 0, -2) @ scaled(6)}
-        parts["walls"] = floor | wall
+    parts |= room_parts(recipe, place)
     for index, item in enumerate(recipe["objects"]):
-        parts |= _object(f"object{index}", item, place)
+        parts |= _object(f"object{index}", item, place, recipe["scale"])
     no_emitters = recipe["mistake"] == "emitters"
     if no_emitters:
         for part in parts.values():
@@ -316,7 +401,7 @@ def integrator_of(recipe: Recipe) -> dict:
     return chosen | wrong.get(mistake, {})
 
 
-def _sensor(recipe: Recipe) -> dict:
+def sensor_of(recipe: Recipe) -> dict:
     wanted, scale = recipe["sensor"], recipe["scale"]
     offset = np.array(recipe["offset"], float)
     origin, target = (scale * (np.array(wanted[p], float) + offset) for p in ("origin", "target"))
@@ -352,13 +437,13 @@ def _ids(index: int, item: Recipe) -> list[str]:
     return [f"{name}copy{i}" for i in range(item["instances"])] or [name]
 
 
-def _object(name: str, item: Recipe, place) -> dict:
+def _object(name: str, item: Recipe, place, scale: float) -> dict:
     local = at(*item["at"])
     # Mitsuba warns of turned SDF grids, and light leaks through turned instances of them.
     if item["shape"] != "sdfgrid":
         local = local @ rotation(item["turn"])
     local = local @ scaled(item["size"])
-    bsdf = {"bsdf": material(item["bsdf"])}
+    bsdf = {"bsdf": material(item["bsdf"], scale * item["size"])}
     if not item["instances"]:
         lit = {}
         if item["radiance"] is not None:
@@ -435,27 +520,28 @@ def _curve(number: int) -> str:
     return str(path)
 
 
-def material(recipe: Recipe) -> dict:
-    """A material's dictionary."""
+def material(recipe: Recipe, size: float) -> dict:
+    """A material's dictionary, for an object of that size: bumps are as high."""
     kind = recipe["type"]
     if kind == "textured":
         return {"type": "diffuse", "reflectance": _texture(recipe["seed"], raw=False)}
     if kind in WRAPPERS:
-        return _wrapped(recipe, material(recipe["inner"]))
+        return _wrapped(recipe, material(recipe["inner"], size), size)
     return {name: _value(name, value) for name, value in recipe.items()}
 
 
-def _wrapped(recipe: Recipe, inner: dict) -> dict:
+def _wrapped(recipe: Recipe, inner: dict, size: float) -> dict:
     kind = recipe["type"]
     if kind == "blendbsdf":
-        both = {"a": inner, "b": material(recipe["other"])}
+        both = {"a": inner, "b": material(recipe["other"], size)}
         return {"type": kind, "weight": recipe["weight"], **both}
     if kind == "mask":
         return {"type": kind, "opacity": recipe["opacity"], "inner": inner}
     if kind == "normalmap":
         return {"type": kind, "normalmap": _texture(0, raw=True), "inner": inner}
     if kind == "bumpmap":
-        return {"type": kind, "arbitrary": _texture(0, raw=True), "inner": inner}
+        bumps = {"arbitrary": _texture(0, raw=True), "scale": size}
+        return {"type": kind, **bumps, "inner": inner}
     return {"type": kind, "inner": inner}
 
 
@@ -488,7 +574,7 @@ def _light(light: Recipe, place, scale: float) -> dict:
         texels = np.random.default_rng(light["seed"]).uniform(0, power, (4, 8, 3))
         return {"type": kind, "bitmap": mi.Bitmap(texels.astype(np.float32))}
     if kind == "sunsky":
-        return {"type": kind, "sun_direction": [0.3, 0.2, 0.8]}
+        return {"type": kind, "sun_direction": light["sun"]}
     lamp = at(*light["at"]) @ mi.ScalarTransform4f().rotate([1, 0, 0], 180) @ scaled(0.3)
     return {"type": "rectangle", "to_world": place @ lamp} | grey(0) | {"emitter": _emission(power)}
 
@@ -504,8 +590,8 @@ class Means:
     error: float
 
     @classmethod
-    def of(cls, scene, integrator, spp: int, seeds: int) -> Means:
-        pictures = [render(scene, integrator, spp, seed) for seed in range(seeds)]
+    def of(cls, scene, sensor, integrator, spp: int, seeds: int) -> Means:
+        pictures = [render(scene, sensor, integrator, spp, seed) for seed in range(seeds)]
         values = np.array([picture.mean(dtype=np.float64) for picture in pictures])
         return cls(values.mean(), values.std(ddof=1) / math.sqrt(seeds))
 
@@ -514,9 +600,9 @@ class NotFinite(AssertionError):
     """A picture has values that are no numbers, or infinite."""
 
 
-def render(scene, integrator, spp: int, seed: int) -> np.ndarray:
+def render(scene, sensor, integrator, spp: int, seed: int) -> np.ndarray:
     """A picture, all its pixels finite and, but for residuals, not negative."""
-    picture = np.array(mi.render(scene, integrator=integrator, spp=spp, seed=seed))
+    picture = np.array(mi.render(scene, None, sensor, integrator, seed=seed, spp=spp))
     if not np.isfinite(picture).all():
         raise NotFinite(f"{(~np.isfinite(picture)).sum()} values aren't finite")
     estimates_residual = getattr(integrator, "residual_probability", 0) > 0
@@ -524,38 +610,66 @@ def render(scene, integrator, spp: int, seed: int) -> np.ndarray:
     return picture
 
 
-def check(recipe: Recipe) -> None:
-    """Raise ``AssertionError`` if the recipe's integrator doesn't do as it should."""
+def load_scene(recipe: Recipe) -> tuple[mi.Scene, mi.Sensor]:
+    """The scene, and the sensor to render: its own, or one to be passed."""
+    scene = mi.load_dict(scene_of(recipe), optimize=False)
+    if recipe["given"] is None:
+        return scene, scene.sensors()[0]
+    return scene, mi.load_dict(sensor_of(recipe))
+
+
+def check(recipe: Recipe) -> float:
+    """Raise ``AssertionError`` if the recipe's integrator doesn't do as it should.
+
+    Returns the error that the cache states.
+    """
     mistake = applicable_mistake(recipe)
     if mistake:
         check_mistake(recipe, MISTAKES[mistake])
-        return
-    scene = mi.load_dict(scene_of(recipe), optimize=False)
+        return 0.0
     ours = mi.load_dict(integrator_of(recipe))
+    scene, sensor = _after_history(recipe, ours)
     width, height = recipe["sensor"]["crop"][2:] if recipe["sensor"]["crop"] else (SIZE, SIZE)
-    picture = render(scene, ours, 16, 0)
+    picture = render(scene, sensor, ours, 16, 0)
     assert picture.shape == (height, width, 3)
     ceiling = brightest(recipe)
     assert picture.max() <= ceiling, f"up to {picture.max():g}, {ceiling:g} is possible"
+    stated = ours.prepare(scene, sensor, 16).relative_error
     hidden = recipe["parameters"].get("hide_emitters", False)
     text = json.dumps(recipe)
     if hidden and '"mask"' in text:
-        return  # Of what a mask reflects, path hides the part that it lets through to the sky, too.
+        return stated  # Of what a mask reflects, path hides what it lets through to the sky, too.
     if recipe["scale"] < TINIEST:
-        return
+        return stated
     path = mi.load_dict({"type": "path", "hide_emitters": hidden})
     scene_of_path = scene
     if any(f'"{kind}"' in text for kind in SEE_THROUGH):
         scene_of_path = mi.load_dict({"sky": BLACK_SKY} | scene_of(recipe), optimize=False)
     for spp in (16, 256):  # The more expensive look only decides where the first one doubts.
         try:
-            expected = Means.of(scene_of_path, path, 4 * spp, 8)
+            expected = Means.of(scene_of_path, sensor, path, 4 * spp, 8)
         except NotFinite:
-            return  # Normals that are no numbers, for example.
-        problem = disagreement(Means.of(scene, ours, spp, 8), expected, BIAS[recipe["integrator"]])
+            return stated  # Normals that are no numbers, for example.
+        found = Means.of(scene, sensor, ours, spp, 8)
+        # All of ours share one cache, whose own noise isn't in their scatter: it's stated.
+        stated = ours.prepare(scene, sensor, spp).relative_error
+        problem = disagreement(found, expected, BIAS[recipe["integrator"]] + STATED * stated)
         if not problem:
-            return
-    raise AssertionError(problem)
+            return stated
+    raise AssertionError(f"{problem}; stated error {stated:g}")
+
+
+def _after_history(recipe: Recipe, ours: mi.Integrator) -> tuple[mi.Scene, mi.Sensor]:
+    """The recipe's scene, after the integrator has rendered what was before, and its sensor."""
+    earlier = earlier_scene(recipe)
+    if earlier:
+        render(*load_scene(earlier), ours, 16, 0)
+    if not recipe["start"]:
+        return load_scene(recipe)
+    scene, sensor = load_scene(first_frame(recipe))
+    render(scene, sensor, ours, 16, 0)
+    move(scene, sensor, recipe, sensor_of(recipe)["to_world"])
+    return scene, sensor
 
 
 def applicable_mistake(recipe: Recipe) -> str | None:
@@ -567,8 +681,8 @@ def applicable_mistake(recipe: Recipe) -> str | None:
 
 def check_mistake(recipe: Recipe, message: str) -> None:
     try:
-        scene = mi.load_dict(scene_of(recipe), optimize=False)
-        mi.render(scene, integrator=mi.load_dict(integrator_of(recipe)), spp=1)
+        scene, sensor = load_scene(recipe)
+        render(scene, sensor, mi.load_dict(integrator_of(recipe)), 1, 0)
     except (ValueError, TypeError, RuntimeError) as error:
         text = condense(error.__cause__ or error)  # ``mi.render`` wraps what integrators raise.
         assert message in text, text
@@ -629,7 +743,7 @@ def run_batch(number: int, count: int, report: Path) -> None:
         def all_of_them(recipe):
             note(started=recipe)
             try:
-                check(recipe)
+                stated = check(recipe)
             except Exception as error:
                 note(
                     failed=condense(error.__cause__ or error),
@@ -637,7 +751,7 @@ def run_batch(number: int, count: int, report: Path) -> None:
                     recipe=recipe,
                 )
             else:
-                note(passed=True)
+                note(passed=True, stated=stated)
 
         all_of_them()
 
@@ -675,13 +789,14 @@ def run_many(count: int, batch: int, first: int, folder: Path) -> int:
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz.scenes", description=__doc__)
     parser.add_argument("--count", type=int, default=2000, help="scenes (default: 2000)")
+    parser.add_argument("--each", type=int, default=50, help="scenes of each batch (default: 50)")
     parser.add_argument("--first", type=int, default=0, help="number of the first batch")
     parser.add_argument("--batch", type=int, help="check this batch in this process")
     parser.add_argument("--repeat", type=Path, help="check the scene of this recipe")
     parser.add_argument("--out", type=Path, default=Path("renders/fuzz"), help="folder")
     args = parser.parse_args()
     if args.batch is None and args.repeat is None:
-        return 1 if run_many(args.count, 50, args.first, args.out) else 0
+        return 1 if run_many(args.count, args.each, args.first, args.out) else 0
     mi.set_variant("llvm_ad_rgb")
     if args.repeat:
         check(json.loads(args.repeat.read_text()))
