@@ -455,7 +455,7 @@ LIGHT = {
     "light through a mask": Case(
         lambda: behind("mask", opacity=0.5, inner=grey(0.5)["bsdf"]), enclosed(1, 0.7), spp=64
     ),
-    "light through nothing": Case(lambda: behind("null"), enclosed(1, 0.7)),
+    "light through nothing": Case(lambda: behind("null"), enclosed(1, 0.7), spp=64),
     "hidden lamps": Case(small_room, ROOM, settings={"hide_emitters": True}),
     "hidden sky": Case(small_open, enclosed(1, 0.7), settings={"hide_emitters": True}),
     "hidden sky behind a pane": Case(

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import time
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -22,19 +23,25 @@ from .maps.clusters import (
 from .maps.cube_map import CubeMap, from_stored, to_parts
 from .memory import check_memory
 from .radiosity.direct_light import choose_sources, survey_direct_light
-from .radiosity.evenness import drop_uneven
+from .radiosity.evenness import sort_out_uneven
 from .radiosity.irradiance import IrradianceCache, solve_irradiance
+from .radiosity.patch_points import only_standing
 from .radiosity.patches import BUCKET, Patches, build_patches
 from .radiosity.spaces import find_spaces, separate
 from .radiosity.surface_points import ObjectIds, scatter_points
+from .radiosity.views import Service, usual_service, view_name
 from .rendering.source_choice import Emitters
 from .rendering.transport import Transport
 from .storage import StorageError, Stored, read, write
 
 #: Patches that a render is worth, at least and at most, and camera samples for which there is one.
+#: Renders of nearly the same size get the same: there are few steps of the size in between.
 LEAST_PATCHES, MOST_PATCHES, SAMPLES_PER_PATCH = 8192, 16384, 1536
+STEPS_PER_OCTAVE = 2
 #: Gather rays for each camera sample, about; of a patch at most: all are kept until it's solved.
 GATHER_SHARE, MOST_PATCH_SAMPLES = 1 / 16, 256
+#: Gather rays that may be added for each camera sample, and at least and at most in all.
+MORE_SHARE, LEAST_MORE, MOST_MORE = 1 / 4, 1 << 21, 1 << 23
 #: Surface points per patch of the budget.
 POINTS_PER_PATCH = 24
 #: Memory [bytes] taken at most by a patch of the budget, by each of its gather rays, and by each of
@@ -46,12 +53,14 @@ PATCH_MEMORY, RAY_MEMORY, TEXEL_MEMORY = 10000, 40, 130
 class Settings:
     """What the pre-passes depend on besides the scene; see the integrators for the meanings.
 
-    ``patches`` and ``patch_samples`` are None until the size of a render decides.
+    ``patches`` and ``patch_samples`` are None until the size of a render decides, which also gives
+    ``more_rays``: gather rays that may be added where light is rare.
     """
 
     patches: int | None
     patch_samples: int | None
     least_patch_samples: int
+    more_rays: int = 0
     maps: bool = False
     map_resolution: int = 0
     map_samples: int = 0
@@ -68,23 +77,31 @@ class Settings:
         """
         patches = self.patches
         if patches is None:
-            patches = min(max(n_samples // SAMPLES_PER_PATCH, LEAST_PATCHES), MOST_PATCHES)
+            worth = max(n_samples / SAMPLES_PER_PATCH / LEAST_PATCHES, 1)
+            octaves = round(STEPS_PER_OCTAVE * math.log2(worth)) / STEPS_PER_OCTAVE
+            patches = min(int(LEAST_PATCHES * 2**octaves), MOST_PATCHES)
         samples = self.patch_samples
         if samples is None:
             most = int(GATHER_SHARE * n_samples / patches)
             samples = max(1 << most.bit_length() >> 1, self.least_patch_samples)
             samples = min(samples, MOST_PATCH_SAMPLES)
-        return replace(self, patches=patches, patch_samples=samples)
+        more = min(max(int(MORE_SHARE * n_samples), LEAST_MORE), MOST_MORE)
+        more = LEAST_MORE if self.patch_samples else 1 << more.bit_length() - 1
+        return replace(self, patches=patches, patch_samples=samples, more_rays=more)
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """The baked state of a scene, the same for every view.
+    """The baked state of a scene, for all views of what some sensors see.
 
     key                content hash of the scene, and the settings
     cache              irradiance on the patches
     sources            [R * L * 4]  probabilities of the emitters (``SourceChoice.table``),
     source_rows        [C]          ... and which row is each large cell's
+    views              names (``view_name``) of the sensors that it was made for,
+    service            ... and what the coarse mesh does for them
+    relative_error     [1]          standard error of the brightness of their pictures that comes
+                                    from the noise of the cache
     maps               one cube map per cluster
     cluster_of_cell    cluster index of each large cell, ``len(maps)`` where there is none
     stage_times        seconds spent in each stage
@@ -94,6 +111,9 @@ class Prepared:
     cache: IrradianceCache
     sources: mi.Float
     source_rows: mi.UInt32
+    views: tuple[str, ...]
+    service: Service
+    relative_error: float
     maps: tuple[CubeMap, ...] = ()
     cluster_of_cell: np.ndarray | None = None
     stage_times: dict[str, float] = field(default_factory=dict)
@@ -103,16 +123,24 @@ class Prepared:
         save(path, self)
 
 
-def prepare(scene: mi.Scene, key: str, settings: Settings, owner: str, baker=None) -> Prepared:
-    """Run the pre-passes. ``baker`` is the ``envmap_bake`` that fills the maps.
+def prepare(
+    scene: mi.Scene,
+    key: str,
+    settings: Settings,
+    sensors: list[mi.Sensor],
+    owner: str,
+    baker=None,
+) -> Prepared:
+    """Run the pre-passes for the views of some sensors.
 
-    ``settings`` are those ``for_render``.
+    ``settings`` are those ``for_render``; ``baker`` is the ``envmap_bake`` that fills the maps.
     Raises ``ValueError``, in the name of ``owner``, if there is too little memory for the settings.
     """
     check_memory(
         owner,
         f"{settings.patches} patches with {settings.patch_samples} samples each",
-        settings.patches * (PATCH_MEMORY + RAY_MEMORY * settings.patch_samples),
+        settings.patches * (PATCH_MEMORY + RAY_MEMORY * settings.patch_samples)
+        + settings.more_rays * RAY_MEMORY,
         'lower "patches" or "patch_samples"',
     )
     times: dict[str, float] = {}
@@ -120,9 +148,10 @@ def prepare(scene: mi.Scene, key: str, settings: Settings, owner: str, baker=Non
     with _timed(times, "coarse mesh"):
         object_ids = ObjectIds(scene)
         points = scatter_points(
-            scene, object_ids, POINTS_PER_PATCH * settings.patches, settings.map_mirrors
+            scene, object_ids, POINTS_PER_PATCH * settings.patches, sensors, settings.map_mirrors
         )
         patches, patch_of_point, cell_of_point = build_patches(points, object_ids, settings.patches)
+        patch_of_point = only_standing(points, patches, patch_of_point)
         space = find_spaces(scene, points, patch_of_point)
         patches, patch_of_point, cell_of_point = separate(
             scene, object_ids, patches, points, patch_of_point, cell_of_point, space
@@ -132,18 +161,28 @@ def prepare(scene: mi.Scene, key: str, settings: Settings, owner: str, baker=Non
         emitters = Emitters(scene)
         light = survey_direct_light(scene, emitters, points, patch_of_point, patches.count)
         sources = choose_sources(emitters, light, points, cell_of_point, patches)
-        patches, patch_of_point = drop_uneven(light, patches, patch_of_point)
+        patches, patch_of_point = sort_out_uneven(light, patches, patch_of_point)
 
     with _timed(times, "irradiance cache"):
-        cache, escaped_share = solve_irradiance(
+        solution = solve_irradiance(
             scene,
             Transport(patches, object_ids, sources),
             points,
             patch_of_point,
             cell_of_point,
             settings.patch_samples,
+            settings.more_rays,
         )
-    prepared = Prepared(key, cache, sources.table, sources.row_of_cell, stage_times=times)
+    prepared = Prepared(
+        key,
+        solution.cache,
+        sources.table,
+        sources.row_of_cell,
+        tuple(map(view_name, sensors)),
+        usual_service(points, patch_of_point),
+        solution.noise,
+        stage_times=times,
+    )
     if not settings.maps:
         return prepared
 
@@ -153,7 +192,8 @@ def prepare(scene: mi.Scene, key: str, settings: Settings, owner: str, baker=Non
                 points, space, scene, settings.requests, settings.distance_ratio
             )
         else:
-            share = np.where(patch_of_point >= 0, escaped_share[patch_of_point], 0)
+            share = solution.escaped_share[patch_of_point]
+            share = np.where(patch_of_point >= 0, share, 0)
             clusters, cluster_of_point = _paying_clusters(points, space, settings, share)
         membership = cluster_of_cell(
             len(clusters), cluster_of_point, cell_of_point, dr.width(patches.levels)
@@ -225,6 +265,9 @@ def save(path, prepared: Prepared) -> None:
         "channels": len(mi.Spectrum()),
         "sources": dr.width(prepared.sources),
         "source_rows": dr.width(prepared.source_rows),
+        "views": list(prepared.views),
+        "service": [asdict(prepared.service)],
+        "relative_error": prepared.relative_error,
         "maps": maps,
         "stage_times": prepared.stage_times,
     }
@@ -280,6 +323,7 @@ def _prepared(stored: Stored, key: str, n_emitters: int) -> Prepared:
     )
     if any(cube_map.n_channels != n_channels for cube_map in maps):
         raise stored.refusal(f"its maps haven't {n_channels} colour channels")
+    (service,) = stored.entries("service")
     membership = None
     if maps or "cluster_of_cell" in stored.parts:
         membership = values("cluster_of_cell", "cluster", np.uint32, n_cells)
@@ -290,6 +334,9 @@ def _prepared(stored: Stored, key: str, n_emitters: int) -> Prepared:
         IrradianceCache(patches, upload(mi.Float, table)),
         upload(mi.Float, sources),
         upload(mi.UInt32, rows),
+        tuple(stored.texts("views")),
+        Service(service.number("found"), service.number("patches")),
+        stored.number("relative_error"),
         maps,
         membership,
         stored.numbers("stage_times"),

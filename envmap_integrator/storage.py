@@ -24,7 +24,7 @@ from .memory import free_memory
 
 #: EXR attribute that holds our metadata, as JSON.
 ATTRIBUTE = "envmap_integrator"
-FORMAT = 3
+FORMAT = 4
 
 _MAGIC = b"v/1\x01"
 #: The attribute as it lies in a file, within its first bytes; so it began in every format.
@@ -122,6 +122,13 @@ class Stored:
 
     def text(self, name: str) -> str:
         return self._value(name, "a string", lambda value: isinstance(value, str))
+
+    def texts(self, name: str) -> list[str]:
+        return self._value(
+            name,
+            "a list of strings",
+            lambda v: isinstance(v, list) and all(isinstance(entry, str) for entry in v),
+        )
 
     def flag(self, name: str) -> bool:
         return self._value(name, "true or false", lambda value: isinstance(value, bool))

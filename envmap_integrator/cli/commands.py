@@ -36,8 +36,10 @@ def render(args: argparse.Namespace) -> int:
         for_denoiser = args.denoise and prepare_for_denoiser(integrator)
         if args.denoise:  # Fails before the work starts, if there is no denoiser.
             warm_up(*sensor.film().crop_size())
+        state = None
         if hasattr(integrator, "prepare"):
-            seconds |= integrator.prepare(scene, sensor, args.spp).stage_times
+            state = integrator.prepare(scene, sensor, args.spp)
+            seconds |= state.stage_times
         with measure(seconds, "render"):
             # Not mi.render, which would make another exception of Ctrl-C.
             dr.eval(integrator.render(scene, sensor, seed=args.seed, spp=args.spp))
@@ -54,6 +56,8 @@ def render(args: argparse.Namespace) -> int:
     metadata["settings"] = json.dumps(settings)
     metadata["stage_times"] = json.dumps(seconds)
     metadata["compilation_time"] = compilation
+    if state:
+        metadata["cache_error"] = state.relative_error
     write_bitmap(output, bitmap)
     if args.png:
         write_png(output.with_suffix(".png"), bitmap)

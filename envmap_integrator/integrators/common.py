@@ -13,6 +13,7 @@ from ..interrupt import interruptible
 from ..parameters import Parameters
 from ..pipeline import Prepared, Settings, load, prepare
 from ..radiosity.surface_points import ObjectIds
+from ..radiosity.views import service, view_name
 from ..rendering.camera import CameraSample, camera_radiance
 from ..rendering.film import INDIRECT_AOVS, expose, expose_gathered, most_samples, n_pixels_of, rgb
 from ..rendering.source_choice import Emitters, SourceChoice
@@ -28,6 +29,10 @@ SAMPLERS = (
     "orthogonal",
     "scene",
 )
+#: Prepared states that an integrator keeps: of views in different rooms, and of other sizes.
+MOST_STATES = 8
+#: Relative standard error of a picture's brightness, by the cache's noise, that users are told of.
+DOUBTFUL = 0.01
 
 
 @dataclass(frozen=True)
@@ -74,7 +79,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
         self.cache_file = parameters.text("cache_file")
         self._fingerprint = SceneFingerprint()
         self._made_for = ("", "")
-        self._prepared: dict[Settings, Prepared] = {}
+        self._prepared: dict[tuple[Settings, str], Prepared] = {}
         self._objects: SceneObjects | None = None
         self._seed = 0
 
@@ -103,15 +108,19 @@ class CachedIntegrator(mi.SamplingIntegrator):
 
     # ---------------------- Preparation ----------------------
 
-    def prepare(self, scene: mi.Scene, sensor: mi.Sensor | int = 0, spp: int = 0) -> Prepared:
+    def prepare(
+        self, scene: mi.Scene, sensor: mi.Sensor | int | None = None, spp: int = 0
+    ) -> Prepared:
         """Run the pre-passes for a render of a sensor, unless they have been run.
 
-        Larger renders get a finer irradiance cache, unless ``patches`` and ``patch_samples`` are
-        set. Those that get the same share the result: it doesn't depend on the view. It's rebuilt
-        when a parameter of a shape, material or emitter of the scene changes.
+        They are made for all sensors of the scene, and for the given one if it isn't the scene's;
+        None stands for the first. Other views share the result if it serves them as well. Larger
+        renders get a finer irradiance cache, unless ``patches`` and ``patch_samples`` are set. It's
+        rebuilt when a parameter of a shape, material or emitter of the scene changes, and for
+        sensors that see what none has seen before.
 
         Raises ``ValueError`` for scenes that can't be rendered and for a ``cache_file`` that is
-        missing, damaged, or of another scene or other settings.
+        missing, damaged, or of another scene, other settings or other views.
         """
         check_not_frozen(self.owner)
         settings = self.settings()
@@ -119,17 +128,64 @@ class CachedIntegrator(mi.SamplingIntegrator):
         if (key, self.cache_file) != self._made_for:
             check_scene(scene, self.owner)
             self._made_for, self._prepared = (key, self.cache_file), {}
+        sensors = list(scene.sensors())
+        if isinstance(sensor, mi.Sensor):
+            view = sensor
+        else:
+            view = sensors[sensor or 0] if sensors else None
+        name = view_name(view) if view else ""
+        if view and name not in map(view_name, sensors):
+            sensors.append(view)
         if not self.cache_file:
-            settings = settings.for_render(_camera_samples(scene, sensor, spp))
-        if settings not in self._prepared:
-            self._prepared[settings] = self._make(scene, key, settings)
-        return self._prepared[settings]
+            settings = settings.for_render(_camera_samples(view, spp))
+        if (settings, name) not in self._prepared:
+            state = self._that_serves(scene, settings, view)
+            if state is None:
+                state = self._make(scene, key, settings, sensors)
+                for served in state.views:
+                    self._keep(settings, served, state)
+            if self.cache_file and not self._serves(state, scene, view):
+                raise ValueError(
+                    f'{self.owner}: "cache_file" {self.cache_file} was made for other views than '
+                    "this sensor's; make it again with envmap-render bake, with this sensor in the "
+                    "scene"
+                )
+            self._keep(settings, name, state)
+        return self._prepared[settings, name]
 
-    def _make(self, scene: mi.Scene, key: str, settings: Settings) -> Prepared:
+    def _keep(self, settings: Settings, view: str, state: Prepared) -> None:
+        """Remember which state serves a view, and forget those that haven't been used for long."""
+        self._prepared[settings, view] = state
+        states = list({id(state): state for state in self._prepared.values()}.values())
+        for old in states[:-MOST_STATES]:
+            self._prepared = {k: s for k, s in self._prepared.items() if s is not old}
+
+    def _that_serves(self, scene, settings: Settings, view: mi.Sensor | None) -> Prepared | None:
+        """What has been prepared for other views, if it serves this one too."""
+        states = {id(s): s for (its, _), s in self._prepared.items() if its == settings}
+        return next((s for s in states.values() if self._serves(s, scene, view)), None)
+
+    def _serves(self, state: Prepared, scene: mi.Scene, view: mi.Sensor | None) -> bool:
+        if view is None or view_name(view) in state.views:
+            return True
+        with dr.suspend_grad():
+            found = service(scene, self.objects_of(scene).ids, state.cache.patches, view)
+        return found.suffices(state.service)
+
+    def _make(self, scene, key: str, settings: Settings, sensors: list[mi.Sensor]) -> Prepared:
         if self.cache_file:
-            return load(self.cache_file, key, self.owner, len(scene.emitters()))
-        with interruptible(), dr.suspend_grad():
-            return prepare(scene, key, settings, self.owner, self.bake_with())
+            state = load(self.cache_file, key, self.owner, len(scene.emitters()))
+        else:
+            with interruptible(), dr.suspend_grad():
+                state = prepare(scene, key, settings, sensors, self.owner, self.bake_with())
+        if state.relative_error > DOUBTFUL:
+            mi.Log(
+                mi.LogLevel.Warn,
+                f"{self.owner}: little light finds its way to what is seen; the picture may be too "
+                f"bright or too dark by {2 * state.relative_error:.1%} (two standard errors); take "
+                'more samples per pixel, or raise "patch_samples"',
+            )
+        return state
 
     def objects_of(self, scene: mi.Scene) -> SceneObjects:
         """The same record as long as nothing in the scene changes."""
@@ -220,6 +276,11 @@ class CachedIntegrator(mi.SamplingIntegrator):
         return sampler, spp
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
+        if not scene.sensors():
+            raise ValueError(
+                f"{self.owner}: within another integrator only sensors of the scene are known, and "
+                "there are none; add the sensor to the scene"
+            )
         transport = self.transport(scene, self.prepare(scene), sampler.sample_count())
         found = self.radiance(scene, transport, sampler, ray, active)
         if dr.grad_enabled(found.radiance):
@@ -255,10 +316,8 @@ class GatheringIntegrator(CachedIntegrator):
         self.clamp_indirect = parameters.number("clamp_indirect", 0.0, 0.0)
 
 
-def _camera_samples(scene: mi.Scene, sensor: mi.Sensor | int, spp: int) -> int:
-    """Number of samples of a render of a sensor; 0 if the scene has none."""
-    if isinstance(sensor, int):
-        if not scene.sensors():
-            return 0
-        sensor = scene.sensors()[sensor]
+def _camera_samples(sensor: mi.Sensor | None, spp: int) -> int:
+    """Number of samples of a render of a sensor, if there is one."""
+    if sensor is None:
+        return 0
     return n_pixels_of(sensor.film()) * (spp or sensor.sampler().sample_count())

@@ -101,7 +101,8 @@ def listed_clusters(
             member &= space == np.bincount(space[member & (space >= 0)]).argmax()
         ratio = request.distance_ratio or distance_ratio
         cluster = _cluster(request.name, points.position[member], ratio)
-        if _holds(cluster, points):
+        box = scene.bbox()  # The sensors may have seen a part of it only.
+        if _holds(cluster, *points.box) and _holds(cluster, box.min, box.max):
             mi.Log(
                 mi.LogLevel.Warn,
                 f"{owner}: its cube holds the whole scene, so there is nothing to map; set a "
@@ -152,7 +153,7 @@ def find_clusters(
     for g in best:
         member = contents[np.isin(voxel, kept[group == g])]
         cluster = _cluster(f"cluster{len(clusters)}", points.position[member], distance_ratio)
-        if not _holds(cluster, points):
+        if not _holds(cluster, *points.box):
             cluster_of_point[member] = len(clusters)
             clusters.append(cluster)
     return clusters, cluster_of_point
@@ -222,11 +223,10 @@ def _cluster(name: str, position: np.ndarray, distance_ratio: float) -> Cluster:
     return Cluster(name, (low + high) / 2, radius, distance_ratio * radius)
 
 
-def _holds(cluster: Cluster, points: SurfacePoints) -> bool:
-    """Does the cube hold the whole scene, so that nothing is left for a map?"""
-    low, high = points.box
-    inside = (cluster.centre - cluster.half_width <= low) & (
-        cluster.centre + cluster.half_width >= high
+def _holds(cluster: Cluster, low, high) -> bool:
+    """Does the cube hold the whole box [3], so that nothing is left for a map?"""
+    inside = (cluster.centre - cluster.half_width <= np.ravel(low)) & (
+        cluster.centre + cluster.half_width >= np.ravel(high)
     )
     return bool(inside.all())
 

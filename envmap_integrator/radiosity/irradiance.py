@@ -1,8 +1,7 @@
 """The radiosity pass: irradiance on the patches, by gathering (paper section 1, 2).
 
-One batch of rays per patch measures the light transport between patches once, as in ray tracing
-based radiosity (Wallace et al. 1987). The radiosity system is then solved over those records for
-any number of bounces without tracing another ray.
+The radiosity system is solved over the records of gather rays for any number of bounces without
+tracing another ray. Where the picture hangs on few rays that found light, more are sent.
 """
 
 from __future__ import annotations
@@ -15,9 +14,10 @@ import mitsuba as mi
 import numpy as np
 from scipy.sparse.linalg import LinearOperator, gmres
 
-from ..jit import give_back, mean_channel, mix, unit, upload
+from ..jit import give_back, upload
 from ..progress import stage
-from .direct_light import finite, sample_irradiance
+from .gather import FLOATS_PER_RAY, Blocks, GatherRays, block_mean, gather
+from .noise import cache_noise
 from .patch_points import PatchPoints
 from .patches import Patches
 from .surface_points import SurfacePoints
@@ -31,12 +31,8 @@ TOLERANCE = 1e-5
 #: Bounces that are followed one by one, those between tests of that (each makes the host wait), and
 #: directions that the rest is searched in at a time.
 MAX_BOUNCES, CHECK_EVERY, KRYLOV = 64, 4, 32
-#: Steps of the R2 sequence (Roberts 2018).
-R2 = (0.7548776662466927, 0.5698402909980532)
-#: Gather rays per kernel launch: bounds memory.
-MAX_LANES = 1 << 22
-#: Floats that gather rays leave, and the iteration for them.
-FLOATS_PER_RAY = 12
+#: What part of the further rays is sent at a time, and what sets the seeds apart.
+MORE, SEED_STEP = (0.25, 0.75), 0x10001
 
 
 @dataclass(frozen=True)
@@ -56,6 +52,21 @@ class IrradianceCache:
         return dr.gather(mi.Spectrum, self.table, row, active)
 
 
+@dataclass(frozen=True)
+class Solution:
+    """The irradiance cache, and what is known of it.
+
+    cache           the irradiance
+    noise           relative standard error [1] that it leaves in the brightness of the picture
+    escaped_share   [P]  what part of the second moment of the indirect light that a patch's rays
+                    bring has come from no patch but through mirrors and glass, or off what has none
+    """
+
+    cache: IrradianceCache
+    noise: float
+    escaped_share: np.ndarray
+
+
 def solve_irradiance(
     scene: mi.Scene,
     transport: Transport,
@@ -63,152 +74,69 @@ def solve_irradiance(
     patch_of_point: np.ndarray,
     cell_of_point: np.ndarray,
     samples: int,
+    more_rays: int = 0,
     seed: int = 0,
-) -> tuple[IrradianceCache, np.ndarray]:
+) -> Solution:
     """Gather and solve for the irradiance of every patch.
 
-    Also returns, of every patch [P], what part of the second moment of the indirect light that
-    its rays bring has come from no patch but through mirrors and glass, or off what has no patches.
-
-    ``samples`` rays start from random ones of a patch's surface points, with as many shadow rays;
-    ``samples`` must be a power of two. With E_d the direct and E_i the indirect irradiance,
+    ``samples`` rays start from each patch, a power of two, and up to about ``more_rays`` where the
+    picture's error hangs on them. With E_d the direct and E_i the indirect irradiance,
     b the light that gather rays find outside the patches, and w the throughput with which they
     end in patch j, the solution fulfils E_i = mean(π b + w E(j)), where E(j) is E_d + E_i or E_i.
     """
-    members = PatchPoints(points, patch_of_point, transport.patches.count)
-    cells = upload(mi.UInt32, cell_of_point[members.index[members.first[:-1]]])
-    n_patches, launch = len(members.patches), max(MAX_LANES // samples, 1)
-    parts = []
-    with stage("Gathering irradiance", total=n_patches) as advance:
-        for begin in range(0, n_patches, launch):
-            end = min(begin + launch, n_patches)
-            parts.append(_gather(scene, transport, members, cells, begin, end, samples, seed))
-            advance(end - begin)
-    if not parts:  # Nothing but mirrors and glass.
-        n_channels = len(mi.Spectrum())
-        table = dr.zeros(mi.Float, 2 * transport.patches.count * n_channels)
-        return IrradianceCache(transport.patches, table), np.zeros(transport.patches.count)
+    n_patches = transport.patches.count
+    members = PatchPoints(points, patch_of_point, n_patches)
+    n_channels, n_used = len(mi.Spectrum()), len(members.patches)
+    if n_used == 0:  # Nothing but mirrors and glass.
+        table = dr.zeros(mi.Float, 2 * n_patches * n_channels)
+        return Solution(IrradianceCache(transport.patches, table), 0.0, np.zeros(n_patches))
 
-    direct, escaped, escaped_square, weight, row = (
-        _concatenate(part) for part in zip(*parts, strict=True)
-    )
-    patch = upload(mi.UInt32, members.patches)
-    table = _solve(transport.patches.count, patch, direct, escaped, weight, row, samples)
-    cache = IrradianceCache(transport.patches, table)
-    patched_square = _second_moment(weight * cache.irradiance(row), samples)
-    share = escaped_square / dr.maximum(escaped_square + patched_square, 1e-30)
-    escaped_share = np.zeros(transport.patches.count)
-    escaped_share[members.patches] = share.numpy()
-    n_rays = dr.width(row)
-    del parts, weight, row
+    def send(rank, seed):
+        return gather(scene, transport, members, cell_of_point, rank, samples, seed)
+
+    rank = np.arange(n_used)
+    for further in range(len(MORE) + 1):
+        rays = send(rank, seed + further * SEED_STEP)
+        blocks = Blocks(rank, n_used)
+        cache = IrradianceCache(transport.patches, _solve(n_patches, members.patches, rays, blocks))
+        noise = cache_noise(rays, blocks, cache, members, cell_of_point)
+        if further == len(MORE):
+            break
+        # The rays that asked for others don't count any longer: patches whose rays happened to miss
+        # the light would stay dark while the lucky ones are put right.
+        wanted = noise.blocks_wanted(int(MORE[further] * more_rays / samples), samples)
+        if not wanted.any():
+            break
+        rank = np.repeat(np.arange(n_used), wanted)
+    escaped_share = np.zeros(n_patches)
+    escaped_share[members.patches] = noise.escaped_share
+    n_rays = dr.width(rays.row)
+    del rays
     give_back(FLOATS_PER_RAY * n_rays)
-    return cache, escaped_share
+    return Solution(cache, noise.relative_error, escaped_share)
 
 
-def _gather(scene, transport, members, cells, begin, end, samples, seed):
-    """Trace the gather rays of the ``begin``-th … ``end``-th patch.
-
-    Returns direct irradiance, π b and its second moment per patch, throughput and row per ray.
-    """
-    from ..rendering.transport import PathState, follow, mis_weight
-
-    n_lanes = (end - begin) * samples
-    sampler = mi.load_dict({"type": "independent"})
-    seed += 1 + begin
-    sampler.seed(seed, n_lanes)
-    lane = dr.arange(mi.UInt32, n_lanes)
-    rank = lane >> dr.opaque(mi.UInt32, int(np.log2(samples)))
-    member = dr.opaque(mi.UInt32, begin) + rank
-    k = lane & (dr.opaque(mi.UInt32, samples) - 1)
-    si = members.sample(member, sampler.next_1d())
-
-    # ---- Low-discrepancy numbers, rotated at random for each patch (Cranley-Patterson) ----
-    u = _rotated(mi.Float(k) / dr.opaque(mi.Float, samples), mi.radical_inverse_2(k, 0), rank, seed)
-    v = _rotated(mi.Float(k) * R2[0], mi.Float(k) * R2[1], rank, ~seed & 0xFFFFFFFF)
-
-    # ---- Direction: cosine ----
-    wo = mi.warp.square_to_cosine_hemisphere(u)
-    pdf = mi.warp.square_to_cosine_hemisphere_pdf(wo)
-    direction = si.to_world(wo)
-
-    # ---- Direct light, by shadow rays and by the gather rays that hit a source ----
-    sources = transport.sources
-    source_row = sources.row(dr.gather(mi.UInt32, cells, member), True)
-    ds, light = sample_irradiance(scene, sources, si, source_row, v)
-    cosine = dr.maximum(dr.dot(si.sh_frame.n, ds.d), 0)
-    direct = light * dr.select(ds.delta, 1, mis_weight(ds.pdf, cosine * dr.inv_pi))
-
-    start = PathState(
-        ray=si.spawn_ray(direction),
-        depth=mi.UInt32(1),
-        origin=mi.Interaction3f(si),
-        source_row=source_row,
-        pdf=pdf,
-        specular=mi.Bool(False),
-        bounded=mi.Bool(False),
-        cluster=mi.UInt32(0),
-        reach=mi.Float(dr.inf),
-    )
-    above = (dr.dot(si.n, direction) > 0) & (wo.z > 0)
-    end_ = follow(scene, transport, sampler, start, above)
-    direct += dr.pi * end_.direct
-    escaped = dr.pi * (end_.radiance - end_.direct)
-
-    def each(function, x):
-        return type(x)(*(function(component) for component in x))
-
-    direct, escaped, weight = (each(finite, x) for x in (direct, escaped, end_.weight))
-    # Block sums evaluate what they sum up: without this, each of them would trace all rays anew.
-    dr.eval(direct, escaped, weight, end_.row)
-    escaped_square = _second_moment(escaped, samples)
-    direct, escaped = (
-        each(lambda c: dr.block_sum(c, samples) / samples, x) for x in (direct, escaped)
-    )
-    return direct, escaped, escaped_square, weight, end_.row
-
-
-def _second_moment(light, samples) -> mi.Float:
-    """Mean over the rays of each patch of the square of what they bring, over all channels."""
-    square = dr.square(mean_channel(light))
-    dr.eval(square)
-    return dr.block_sum(square, samples) / samples
-
-
-def _rotated(x, y, rank, seed) -> mi.Point2f:
-    """A point set moved round the unit square, by another shift for every patch."""
-    seed_ = dr.opaque(mi.UInt32, seed)
-    bits = (mix(mix(2 * rank + axis) ^ seed_) for axis in range(2))
-    shift = mi.Point2f(*map(unit, bits))
-    point = mi.Point2f(x, y) + shift
-    return point - dr.floor(point)
-
-
-def _concatenate(parts):
-    """One array of scalars or spectra in place of several."""
-    if dr.depth_v(parts[0]) == 1:
-        return dr.concat(parts)
-    return type(parts[0])(*(dr.concat(components) for components in zip(*parts, strict=True)))
-
-
-def _solve(n_patches, patch, direct, escaped, weight, row, samples):
+def _solve(n_patches: int, patch: np.ndarray, rays: GatherRays, blocks: Blocks) -> mi.Float:
     """Solve E_i = escaped + mean(w E(row)), bounce by bounce; returns the irradiance table.
 
     What is left after ``MAX_BOUNCES``, in rooms that are almost white, is solved for at once.
     """
-    direct, escaped = dr.ravel(direct), dr.ravel(escaped)
-    table = dr.zeros(mi.Float, 2 * n_patches * len(weight))
+    direct, escaped = (dr.ravel(blocks.mean(x)) for x in (rays.direct, rays.escaped))
+    dr.eval(direct, escaped)
+    table = dr.zeros(mi.Float, 2 * n_patches * len(mi.Spectrum()))
+    row = 2 * upload(mi.UInt32, patch)
 
     def store(direct, indirect):
-        dr.scatter(table, dr.unravel(mi.Spectrum, direct + indirect), 2 * patch)
-        dr.scatter(table, dr.unravel(mi.Spectrum, indirect), 2 * patch + 1)
+        dr.scatter(table, dr.unravel(mi.Spectrum, direct + indirect), row)
+        dr.scatter(table, dr.unravel(mi.Spectrum, indirect), row + 1)
         dr.eval(table)
 
     def bounce(direct, indirect):
         """What patches receive from each other."""
         store(direct, indirect)
-        arriving = weight * dr.gather(mi.Spectrum, table, row)
+        arriving = rays.weight * dr.gather(mi.Spectrum, table, rays.row)
         dr.eval(arriving)  # Once, not for every block sum.
-        return dr.ravel(mi.Spectrum(*(dr.block_sum(c, samples) / samples for c in arriving)))
+        return dr.ravel(blocks.mean(block_mean(arriving, rays.samples)))
 
     indirect = mi.Float(escaped)
     with stage("Solving irradiance"):

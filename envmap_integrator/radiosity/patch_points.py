@@ -8,7 +8,11 @@ import numpy as np
 from scipy.sparse import coo_matrix
 
 from ..jit import upload
+from .patches import Patches
 from .surface_points import SurfacePoints
+
+#: Parts of a patch along each axis in which rays start equally often.
+PARTS = 4
 
 
 class PatchPoints:
@@ -17,36 +21,74 @@ class PatchPoints:
     patches   [K]      indices of the patches that have points
     first     [K + 1]  where the points of each begin
     index              which points stand for patches, sorted
+    points             all surface points
     """
 
     def __init__(self, points: SurfacePoints, patch_of_point: np.ndarray, n_patches: int):
-        standing = standing_points(points, patch_of_point)
+        standing = np.flatnonzero(patch_of_point >= 0)
         # Rows of a sparse matrix: a counting sort.
         place = patch_of_point[standing], np.arange(len(standing))
         by_patch = coo_matrix((standing, place), (n_patches, len(standing))).tocsr()
         self.patches = np.flatnonzero(np.diff(by_patch.indptr))
         self.first = np.append(by_patch.indptr[self.patches], len(standing)).astype(np.uint32)
-        self.index = by_patch.data
-        self._points = points
-        self._first = upload(mi.UInt32, self.first)
+        self.points = points
+        key = self._parts(points.position[by_patch.data])
+        order = np.argsort(key, kind="stable")
+        self.index = by_patch.data[order]
+        part, first_of_part = np.unique(key[order], return_index=True)
+        first_part = np.searchsorted(part, PARTS**3 * np.arange(len(self.patches) + 1))
+        self._first_part = upload(mi.UInt32, first_part)
+        self._first_of_part = upload(mi.UInt32, np.append(first_of_part, len(key)))
         self._index = upload(mi.UInt32, self.index)
 
-    def sample(self, rank: mi.UInt32, u: mi.Float) -> mi.SurfaceInteraction3f:
-        """A random point of the ``rank``-th patch, as an interaction from which rays can start."""
-        first = dr.gather(mi.UInt32, self._first, rank)
-        n_points = dr.gather(mi.UInt32, self._first, rank + 1) - first
-        k = first + dr.minimum(mi.UInt32(u * mi.Float(n_points)), n_points - 1)
-        return self._points.interaction(dr.gather(mi.UInt32, self._index, k))
+    def _parts(self, position: np.ndarray) -> np.ndarray:
+        """Number of the part of a patch in which each point lies, ascending from patch to patch."""
+        first = self.first[:-1].astype(np.int64)
+        key = np.repeat(np.arange(len(first)), np.diff(self.first.astype(np.int64)))
+        if len(first) == 0:
+            return key
+        rank = key
+        for x in position.T.astype(np.float64):
+            low, high = (f.reduceat(x, first)[rank] for f in (np.minimum, np.maximum))
+            slice_ = (x - low) * (PARTS / np.maximum(high - low, np.finfo(np.float32).tiny))
+            key = PARTS * key + np.minimum(slice_.astype(np.int64), PARTS - 1)
+        return key
+
+    def sample(self, rank: mi.UInt32, u: mi.Float) -> mi.UInt32:
+        """Index of a random surface point of the ``rank``-th patch.
+
+        Each part of the patch that has points is as likely as another: walks come to one side of it
+        a hundred times as often as to the other where they look through a slit.
+        """
+        part, u = _among(self._first_part, rank, u)
+        k, _ = _among(self._first_of_part, part, u)
+        return dr.gather(mi.UInt32, self._index, k)
 
 
-def standing_points(points: SurfacePoints, patch_of_point: np.ndarray) -> np.ndarray:
-    """Indices of the points that stand for patches.
+def _among(first: mi.UInt32, group: mi.UInt32, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+    """One of the places of a group, all as likely, and what is left of the random number."""
+    begin = dr.gather(mi.UInt32, first, group)
+    n = dr.gather(mi.UInt32, first, group + 1) - begin
+    u *= mi.Float(n)
+    k = dr.minimum(mi.UInt32(u), n - 1)
+    return begin + k, u - mi.Float(k)
 
-    Where walks from the sensors have come to a patch, only their points stand for it: global lines
-    also hit what no light reaches, such as the floor under a cupboard, which would darken the part
-    of the patch that looks out.
+
+def only_standing(
+    points: SurfacePoints, patches: Patches, patch_of_point: np.ndarray
+) -> np.ndarray:
+    """The patch of every surface point [N] that stands for it, -1 for the others.
+
+    In the parts of a patch that walks from the sensors have come to, only their points stand for
+    it: global lines also hit what no light reaches, such as the floor under a cupboard, which would
+    darken what looks out.
     """
+    place = points.places()
+    _, size, _ = patches.find_cell(*place)
+    quarter = dr.floor((place[0] - patches.origin) * (2 / size))
+    quarter = mi.Vector3u(mi.Vector3i(quarter) & 1)
+    part = 8 * patch_of_point + (quarter.x + 2 * quarter.y + 4 * quarter.z).numpy()
     has_patch, seen = patch_of_point >= 0, points.seen > 0
-    visited = np.zeros(patch_of_point.max(initial=-1) + 2, dtype=bool)
-    visited[patch_of_point[has_patch & seen]] = True
-    return np.flatnonzero(has_patch & (seen | ~visited[patch_of_point]))
+    visited = np.zeros(8 * patches.count, dtype=bool)
+    visited[part[has_patch & seen]] = True
+    return np.where(has_patch & (seen | ~visited[part]), patch_of_point, -1)

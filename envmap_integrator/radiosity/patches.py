@@ -15,17 +15,22 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..jit import mix, opaque_point, upload, upload_vectors
+from ..jit import mix, opaque_point, upload
 from .surface_points import ObjectIds, SurfacePoints
 
 #: Edge of the large cells as a fraction of the diagonal of the box that holds most surface points
 #: (more if the budget is small), and how often they may be halved.
 LARGE_CELL = 1 / 32
-MAX_LEVEL = 7
+MAX_LEVEL = 12
+#: Points in a large cell from which on the box about them tells how much of it they fill.
+BOXED = 8
 #: Entries of a bucket of the hash tables, read by one packed gather.
 BUCKET = 4
-#: Bits of an entry of the large cells' table that hold the level.
-_LEVEL_BITS = 3
+#: Bits of an entry that don't belong to the fingerprint: of the large cells' table, which hold the
+#: level, and of the patches'.
+_LEVEL_BITS, _MARK_BITS = 4, 2
+#: Marks of a patch: direct light is uneven over it, and it has been left out.
+_UNEVEN, _DROPPED = 1, 2
 
 
 @dataclass(frozen=True)
@@ -38,7 +43,7 @@ class Patches:
     origin      [3]              corner of the grids, world space
     size        [1]              edge of a large cell, world units
     levels      [4 * buckets]    fingerprint and level of each large cell, 0 where empty
-    cells       [P]              fingerprint of each patch, 0 where empty
+    cells       [P]              fingerprint and marks of each patch, 0 where empty
     use_objects                  whether the object id tells cells apart (not with too many objects)
     """
 
@@ -69,18 +74,21 @@ class Patches:
     def find(self, p, normal, object_id, size, active=True, u=None):
         """Look up the patch of an oriented surface point in a cell with patches of edge ``size``.
 
-        Returns ``(patch, found)``. Surfaces too small to have been hit have no patch.
+        Returns ``(patch, found, even)``. Surfaces too small to have been hit have no patch; where
+        direct light isn't ``even``, the patch's irradiance stands for indirect light alone.
 
         With ``u``, uniform in the unit square, the point is moved at random by up to half a patch
         along the surface: the expectation interpolates between patches, so their borders don't
         show. Where the moved point belongs to no patch (beyond an edge of the surface), the patch
-        of the point itself is taken.
+        of the point itself is taken; where that one has been left out, there is none.
         """
         level = mi.UInt32(dr.log2(self.size / size) + 0.5)
         identity = self._identity(normal, object_id)
+        marks, exists, own = self._probe(self.cells, p, identity, level, _MARK_BITS, active)
+        dropped = exists & ((marks & _DROPPED) != 0)
+        found = exists & ~dropped
         if u is None:
-            _, found, patch = self._probe(self.cells, p, identity, level, 0, active)
-            return patch, found
+            return own, found, (marks & _UNEVEN) == 0
 
         frame = mi.Frame3f(normal)
         moved = p + size * (frame.s * (u.x - 0.5) + frame.t * (u.y - 0.5))
@@ -88,10 +96,13 @@ class Patches:
         v = mi.Point2f(256 * u.x - dr.floor(256 * u.x), 256 * u.y - dr.floor(256 * u.y))
         tilted = normal + 0.4 * (frame.s * (v.x - 0.5) + frame.t * (v.y - 0.5))
         around = self._identity(tilted, object_id)
-        _, found, patch = self._probe(self.cells, moved, around, level, 0, active)
-        missed = active & ~found
-        _, own_found, own = self._probe(self.cells, p, identity, level, 0, missed)
-        return dr.select(found, patch, own), found | (missed & own_found)
+        # What has been left out isn't served by its neighbours: it's unlike them.
+        entry, hit, patch = self._probe(
+            self.cells, moved, around, level, _MARK_BITS, active & ~dropped
+        )
+        hit &= (entry & _DROPPED) == 0
+        even = ((marks | dr.select(hit, entry, 0)) & _UNEVEN) == 0
+        return dr.select(hit, patch, own), found | hit, even
 
     def _identity(self, normal, object_id):
         """What tells patches in the same cell apart."""
@@ -155,9 +166,7 @@ def build_patches(
         empty = np.zeros(0, dtype=np.int64)
         return _no_patches(), empty, empty
     (low, _), extent = points.box, points.extent
-    position = upload_vectors(mi.Point3f, points.position)
-    normal = upload_vectors(mi.Normal3f, points.normal)
-    object_id = upload(mi.UInt32, points.object_id)
+    position, normal, object_id = points.places()
     size = extent * LARGE_CELL
     while True:
         # An irrational offset keeps walls, mostly at round coordinates, off the cell borders.
@@ -176,8 +185,11 @@ def build_patches(
             break
         size *= 2
 
-    # ---- Large cells choose their level by their number of points ----
-    level = np.round(0.5 * np.log2(np.maximum(n_points * (budget / len(points)), 1)))
+    # ---- Large cells choose their level by how densely points lie in them ----
+    n_patches = np.maximum(n_points * (budget / len(points)), 1)
+    long, short = _filled(position, cell_of_point, n_points, size)
+    edge = np.maximum(np.sqrt(long * short / n_patches), long / n_patches)
+    level = np.round(-np.log2(np.clip(edge, 2.0**-MAX_LEVEL, 1)))
     level = np.clip(level, 0, MAX_LEVEL).astype(np.uint64)
     payload = np.uint64((1 << _LEVEL_BITS) - 1)
     levels, index_of_large = _hash_table((large & ~payload) | level)
@@ -187,9 +199,29 @@ def build_patches(
     level_of_point = upload(mi.UInt32, level[cell_of_point])
     key = cell_keys(patches, position, identity, level_of_point)
     cells, cell_of_point = np.unique(key, return_inverse=True)
-    cells, patch_of_cell = _hash_table(cells)
+    cells, patch_of_cell = _hash_table(cells & ~np.uint64((1 << _MARK_BITS) - 1))
     patches = replace(patches, levels=upload(mi.UInt32, levels), cells=upload(mi.UInt32, cells))
     return patches, patch_of_cell[cell_of_point], large_of_point
+
+
+def _filled(position, cell_of_point, n_points, size) -> np.ndarray:
+    """How long and how wide [2, C] the points in each large cell lie, over its edge ``size``.
+
+    A house on a plain, or a toy in a room, fills little of a cell that suits its surroundings.
+    """
+    cell, n_cells = upload(mi.UInt32, cell_of_point), len(n_points)
+    extents = []
+    for x in position:
+        low, high = dr.full(mi.Float, dr.inf, n_cells), dr.full(mi.Float, -dr.inf, n_cells)
+        # By default, few cells would be copied for each thread, and their number be compiled in.
+        dr.scatter_reduce(dr.ReduceOp.Min, low, x, cell, mode=dr.ReduceMode.Local)
+        dr.scatter_reduce(dr.ReduceOp.Max, high, x, cell, mode=dr.ReduceMode.Local)
+        extents.append(high - low)
+    dr.eval(extents)
+    longest_first = -np.sort([-extent.numpy() for extent in extents], axis=0)
+    # n points at random leave a margin of 1 / (n + 1) on either side.
+    filled = longest_first[:2] / size * (n_points + 1) / np.maximum(n_points - 1, 1)
+    return np.where(n_points < BOXED, 1, np.minimum(filled, 1))
 
 
 def drop(
@@ -199,9 +231,15 @@ def drop(
 
     Returns the remaining patches and the patch of every surface point [N], -1 where it has none.
     """
-    cells = np.where(dropped, 0, patches.cells.numpy())
+    cells = patches.cells.numpy() | np.where(dropped, np.uint32(_DROPPED), np.uint32(0))
     kept = (patch_of_point >= 0) & ~dropped[patch_of_point]
     return replace(patches, cells=upload(mi.UInt32, cells)), np.where(kept, patch_of_point, -1)
+
+
+def mark_uneven(patches: Patches, uneven: np.ndarray) -> Patches:
+    """Let some patches [P] stand for indirect light alone: shadow rays bring the direct light."""
+    cells = patches.cells.numpy() | np.where(uneven, np.uint32(_UNEVEN), np.uint32(0))
+    return replace(patches, cells=upload(mi.UInt32, cells))
 
 
 def _no_patches() -> Patches:

@@ -13,7 +13,6 @@ from scipy.sparse.csgraph import connected_components
 
 from ..jit import upload
 from ..rendering.ray_counts import Ray, count
-from .patch_points import standing_points
 from .patches import Patches, drop
 from .surface_points import ObjectIds, SurfacePoints
 
@@ -36,7 +35,7 @@ def find_spaces(
 
     A walk stays in the space of its sensor. Sensors are in the same one if their walks see each
     other. Other points are in that of a walk that they see, which is tested only for those that
-    stand for patches: where walks came, these don't. Without sensors, all is one space.
+    stand for patches. Without sensors, all is one space.
     """
     walk = points.seen.astype(np.int64)
     walked = np.flatnonzero(walk)
@@ -51,8 +50,7 @@ def find_spaces(
         n_nodes = int(walk.max()) + 1  # The first stands for no sensor.
         links = coo_matrix((np.ones(linked.sum()), ends), (n_nodes, n_nodes))
         space = connected_components(links, directed=False)[1][walk] - 1
-    standing = standing_points(points, patch_of_point)
-    others = standing[walk[standing] == 0]
+    others = np.flatnonzero((patch_of_point >= 0) & (walk == 0))
     if len(others):
         space[others] = space[sight.first_seen(others, walked, seed)]
     return space
@@ -126,7 +124,7 @@ def separate(
     Returns the remaining patches and, of every surface point [N], the patch and the large cell,
     -1 where it has none, where its space isn't known and where the cell lies in several.
     """
-    standing = standing_points(points, patch_of_point)
+    standing = patch_of_point >= 0
     patch = patch_of_point[standing]
     space_of_patch = np.full(patches.count, -1)
     space_of_patch[patch] = space[standing]
@@ -140,6 +138,18 @@ def separate(
         dropped |= foreign
         cell_of_point = np.where(mixed[cell_of_point], -1, cell_of_point)
     return *drop(patches, patch_of_point, dropped), cell_of_point
+
+
+def _looked_at(scene, object_ids, patches, si, space_of_patch, sampler, active) -> mi.UInt32:
+    """The space of the patch that a random ray from each point hits, ``UNKNOWN`` if none."""
+    direction = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
+    ray = si.spawn_ray(mi.Frame3f(si.n).to_world(direction))
+    count(Ray.SURVEY, ray, active)
+    hit = scene.ray_intersect(ray, active)
+    normal, objects = dr.mulsign(hit.n, -dr.dot(hit.n, ray.d)), object_ids(hit)
+    _, size, found = patches.find_cell(hit.p, normal, objects, active & hit.is_valid())
+    patch, found, _ = patches.find(hit.p, normal, objects, size, found)
+    return dr.select(found, dr.gather(mi.UInt32, space_of_patch, patch, found), UNKNOWN)
 
 
 def _look_around(scene, object_ids, patches, points, space, space_of_patch, seed):
@@ -157,23 +167,17 @@ def _look_around(scene, object_ids, patches, points, space, space_of_patch, seed
 
     # ---- Where no walk came, a point is in the space of what it looks at ----
     own = dr.gather(mi.UInt32, upload(mi.UInt32, space), lane)
-    frame = mi.Frame3f(si.n)
-    ray = si.spawn_ray(frame.to_world(mi.warp.square_to_cosine_hemisphere(sampler.next_2d())))
-    unknown = own == UNKNOWN
-    count(Ray.SURVEY, ray, unknown)
-    hit = scene.ray_intersect(ray, unknown)
-    normal, objects = dr.mulsign(hit.n, -dr.dot(hit.n, ray.d)), object_ids(hit)
-    _, size, found = patches.find_cell(hit.p, normal, objects, unknown & hit.is_valid())
-    patch, found = patches.find(hit.p, normal, objects, size, found)
-    own = dr.select(found, dr.gather(mi.UInt32, space_of_patch, patch, found), own)
+    seen = _looked_at(scene, object_ids, patches, si, space_of_patch, sampler, own == UNKNOWN)
+    own = dr.select(own == UNKNOWN, seen, own)
     known = own != UNKNOWN
 
     # ---- Twice as far as the renderer jitters its look-ups, to be on the safe side ----
     _, size, found = patches.find_cell(si.p, si.n, object_id, known)
     u = sampler.next_2d()
+    frame = mi.Frame3f(si.n)
     p = si.p + size * (frame.s * (u.x - 0.5) + frame.t * (u.y - 0.5))
     cell, size, found = patches.find_cell(p, si.n, object_id, found)
-    patch, has_patch = patches.find(p, si.n, object_id, size, found, sampler.next_2d())
+    patch, has_patch, _ = patches.find(p, si.n, object_id, size, found, sampler.next_2d())
 
     other = dr.gather(mi.UInt32, space_of_patch, patch, has_patch) != own
     foreign = dr.zeros(mi.Bool, patches.count)

@@ -295,13 +295,18 @@ def follow(
         cell, size, found = patches.find_cell(si.p, normal, object_id, mapped)
         next_source_row = transport.sources.row(cell, found)
         deep = found & is_diffuse(bsdf) & (depth >= transport.gather_depth)
-        patch, has_patch = patches.find(si.p, normal, object_id, size, deep, spare.next_2d())
+        patch, has_patch, even = patches.find(si.p, normal, object_id, size, deep, spare.next_2d())
         # A coarse mesh can't serve hits about as near as its patches are large (corners,
         # contacts). The threshold is random, so that no border shows.
-        near = (bounces > 0) & (dr.norm(si.p - origin.p) < size * (0.5 + spare.next_1d()))
+        near = dr.norm(si.p - origin.p) < size * (0.5 + spare.next_1d())
+        # A sensor is no surface. And gather rays start all over their own patch: what they read
+        # near it is an average anyway.
+        if dr.hint(start.primary or cache is None, mode="scalar"):
+            near &= bounces > 0
         served = has_patch & ~near
         # Total irradiance stands for direct light too: single shadow rays beside a lamp are noisy.
-        lit = served & (depth > 0)
+        # But where it changes within patches, a ray knows better.
+        lit = served & even & (depth > 0)
         if dr.hint(transport.shadow_rays, mode="scalar"):
             lit = mi.Bool(False)
         residual_here = served & goes_on

@@ -199,7 +199,9 @@ def preparing_integrator():
     class Preparing(mi.SamplingIntegrator):
         def prepare(self, scene, sensor=0, spp=0):
             return SimpleNamespace(
-                stage_times={"radiosity": 1.25}, save=lambda path: path.write_text("baked")
+                stage_times={"radiosity": 1.25},
+                relative_error=0.25,
+                save=lambda path: path.write_text("baked"),
             )
 
         def sample(self, scene, sampler, ray, medium=None, active=True):

@@ -29,7 +29,19 @@ from envmap_integrator.llvm import ensure_llvm
 from envmap_integrator.maps.clusters import ClusterRequest, listed_clusters
 from envmap_integrator.parameters import Parameters
 from envmap_integrator.rendering import film
-from tests.helpers import ball, camera, cluster, integrator, load, room, unprivileged
+from tests.helpers import (
+    at,
+    ball,
+    box,
+    camera,
+    cluster,
+    grey,
+    integrator,
+    load,
+    room,
+    scaled,
+    unprivileged,
+)
 from tests.unit.kit import surface_points
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -46,6 +58,7 @@ EXCEPTED = {
 }
 MEDIUM = {"type": "homogeneous", "albedo": 0.5, "sigma_t": 1.0}
 #: Of small pieces, so that a change of a file's content is quick.
+FORMAT = f'{{"format": {storage.FORMAT}'.encode()
 SETTINGS = {"patches": 64, "map_resolution": 4, "desk": cluster()}
 
 Site = tuple[str, int]
@@ -119,6 +132,23 @@ def use(make: Callable[[Surroundings], Path]) -> Callable:
     return lambda s: integrator("envmap_hybrid", cache_file=str(make(s)), **SETTINGS).prepare(
         load(room())
     )
+
+
+def seen_from_elsewhere(s: Surroundings) -> None:
+    """From beneath the floor, where no sensor of the scene has been."""
+    below = mi.load_dict(camera(origin=(0, -1.8, -5), target=(0, 0.5, -9)))
+    shell = box(3) | {"to_world": at(0, 0, -6) @ scaled(3)} | grey(0.5)
+    described = room(cellar=shell)
+    path = s.folder / "state.exr"
+    integrator("envmap_hybrid", **SETTINGS).prepare(load(described)).save(path)
+    integrator("envmap_hybrid", cache_file=str(path), **SETTINGS).prepare(load(described), below)
+
+
+def nested_without_sensor(s: Surroundings) -> None:
+    child = {"type": "envmap_hybrid"} | SETTINGS
+    within = mi.load_dict({"type": "aov", "aovs": "d:depth", "child": child})
+    sensor = mi.load_dict(camera())
+    mi.render(load(room(sensor=None)), sensor=sensor, integrator=within, spp=1)
 
 
 def altered(change: Callable[[dict, dict], object]) -> Callable[[Surroundings], Path]:
@@ -308,6 +338,9 @@ CASES = {
     # ---- What else isn't done ----
     "frozen": Case(frozen, "envmap_hybrid", "dr.freeze", "render outside of the frozen function"),
     "gradients": Case(differentiated, "envmap_hybrid", "can't be differentiated", "use prb for"),
+    "no sensor": Case(
+        nested_without_sensor, "envmap_hybrid", "there are none", "add the sensor to the scene"
+    ),
     # ---- The machine ----
     "variant": Case(other_variant, "envmap_hybrid", "variant scalar_rgb", "use one of llvm_ad_rgb"),
     "llvm": Case(old_llvm, "llvm_* variants", "LLVM 15", "need LLVM 17 or newer: "),
@@ -317,7 +350,7 @@ CASES = {
     ),
     "patches": Case(
         little_memory(lambda s: integrator("envmap_hybrid", patches=10**6).prepare(load(room()))),
-        "envmap_hybrid", "1000000 patches with 32 samples each need 11.3 GB, 1.0 GB are free",
+        "envmap_hybrid", "1000000 patches with 32 samples each need 11.4 GB, 1.0 GB are free",
         'lower "patches" or "patch_samples"',
     ),
     "maps": Case(
@@ -343,10 +376,13 @@ CASES = {
         STATE, "not a file of envmap_integrator", AGAIN,
     ),
     "format": Case(
-        use(with_bytes(lambda b: b.replace(b'{"format": 3', b'{"format": 9'))),
-        STATE, "written in format 9, this version reads format 3", AGAIN,
+        use(with_bytes(lambda b: b.replace(FORMAT, b'{"format": 0'))),
+        STATE, f"written in format 0, this version reads format {storage.FORMAT}", AGAIN,
     ),
     "forged": Case(use(with_bytes(forged)), STATE, "not as this version writes", AGAIN),
+    "other views": Case(
+        seen_from_elsewhere, '"cache_file" {folder}/state.exr', "other views", AGAIN
+    ),
     "another scene": Case(use(altered(setting("key", "a b"))), STATE, "another scene", AGAIN),
     "sources": Case(
         use(altered(wrong_rows)), STATE, "rows for 1 emitters", AGAIN

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from envmap_integrator.pipeline import Settings
-from envmap_integrator.radiosity import irradiance
+from envmap_integrator.radiosity import gather
 from tests.helpers import ROOT, camera, cluster, integrator, load, picture, room
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -73,7 +73,7 @@ def test_what_is_set_holds_for_renders_of_any_size(scene):
         (0, 8192, 32),  # no sensor
         (512 * 512, 8192, 32),
         (16 * 512 * 512, 8192, 32),
-        (64 * 512 * 512, 10922, 64),
+        (64 * 512 * 512, 11585, 64),
         (256 * 512 * 512, 16384, 256),
         (1024 * 1920 * 1080, 16384, 256),
     ],
@@ -146,7 +146,7 @@ def test_scenes_of_other_content_do_not(scene):
 
 def test_gathering_in_several_launches_changes_only_the_noise(scene, monkeypatch):
     whole = integrator("one_level_path").prepare(scene).cache.table.numpy()
-    monkeypatch.setattr(irradiance, "MAX_LANES", 1 << 16)
+    monkeypatch.setattr(gather, "MAX_LANES", 1 << 16)
     parts = integrator("one_level_path").prepare(scene).cache.table.numpy()
     assert parts.shape == whole.shape
     assert parts.mean() == pytest.approx(whole.mean(), rel=0.02)

@@ -61,19 +61,18 @@ class CoarseMesh:
         )
         u = u if u is None else mi.Point2f(u.astype(np.float32))
         _, size, known = self.patches.find_cell(p, normal, object_id)
-        patch, found = self.patches.find(p, normal, object_id, size, known, u)
+        patch, found, _ = self.patches.find(p, normal, object_id, size, known, u)
         return patch.numpy(), size.numpy(), found.numpy()
 
     def solve(self, samples: int = 64) -> IrradianceCache:
         transport = Transport(self.patches, self.object_ids, by_weight(Emitters(self.scene)))
-        cache, _ = solve_irradiance(
+        return solve_irradiance(
             self.scene, transport, self.points, self.patch_of_point, self.cell_of_point, samples
-        )
-        return cache
+        ).cache
 
 
 def coarse_mesh(scene: mi.Scene, budget: int = 1024, points_per_patch: int = 128) -> CoarseMesh:
-    points = scatter_points(scene, ObjectIds(scene), points_per_patch * budget)
+    points = scatter_points(scene, ObjectIds(scene), points_per_patch * budget, scene.sensors())
     return coarse_mesh_over(scene, points, budget)
 
 
@@ -92,6 +91,8 @@ def surface_points(position: np.ndarray, normal, object_id=0, seen=1.0) -> Surfa
         normal,
         np.broadcast_to(np.uint32(object_id), len(position)),
         np.broadcast_to(np.float32(seen), len(position)),
+        np.zeros(len(position), bool),
+        np.zeros(len(position), np.uint32),
     )
 
 

@@ -115,6 +115,8 @@ def test_clusters_depend_neither_on_scale_nor_on_place(scale, shift):
         points.shading_normal,
         points.object_id,
         points.seen,
+        points.turned,
+        points.bounce,
     )
     here, there = found(points)[0], found(moved)[0]
     assert len(here) == len(there)

@@ -17,11 +17,11 @@ from envmap_integrator.jit import SpareNumbers
 from envmap_integrator.maps.bake import bake_maps
 from envmap_integrator.maps.clusters import Cluster
 from envmap_integrator.maps.cube import direction_to_face
-from envmap_integrator.radiosity import irradiance
+from envmap_integrator.radiosity import gather, irradiance
 from envmap_integrator.radiosity.surface_points import _global_lines
 from envmap_integrator.rendering import transport
 from envmap_integrator.rendering.source_choice import Emitters, by_weight
-from tests.helpers import at, ball, grey, scaled
+from tests.helpers import ball, grey
 from tests.unit.kit import coarse_mesh, scene_of, surface_points
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -72,11 +72,8 @@ class Numbers:
         return mi.Point2f(next(self.numbers), next(self.numbers))
 
 
-@pytest.fixture(scope="module")
-def globe(variant) -> mi.Scene:
-    """A scene whose bounding sphere is a cube's."""
-    edge, centre = float(2 * RADIUS / np.sqrt(3)), map(float, CENTRE)
-    return scene_of({"type": "cube", "to_world": at(*centre) @ scaled(edge / 2)})
+GLOBE = np.array([[*CENTRE, RADIUS]], dtype=np.float32)
+"""A single sphere that lines go through."""
 
 
 def entries(ray: mi.Ray3f) -> tuple[np.ndarray, np.ndarray]:
@@ -89,10 +86,10 @@ def entries(ray: mi.Ray3f) -> tuple[np.ndarray, np.ndarray]:
     return o - (b + np.sqrt(np.maximum(root, 0)))[:, None] * d, d
 
 
-def test_global_lines_go_in_all_directions(globe):
+def test_global_lines_go_in_all_directions():
     test = mi.chi2.ChiSquareTest(
         domain=mi.chi2.SphericalDomain(),
-        sample_func=lambda u: _global_lines(globe, Numbers(u)).d,
+        sample_func=lambda u: _global_lines(GLOBE, Numbers(u), dr.width(u))[0].d,
         pdf_func=lambda d: dr.full(mi.Float, 1 / (4 * np.pi), dr.width(d)),
         sample_dim=4,
         sample_count=400_000,
@@ -101,11 +98,11 @@ def test_global_lines_go_in_all_directions(globe):
     assert test.run(significance_level=SIGNIFICANCE, quiet=True), test.messages
 
 
-def test_global_lines_hit_surfaces_in_proportion_to_their_area(globe):
+def test_global_lines_hit_surfaces_in_proportion_to_their_area():
     """They enter the sphere anywhere, and from a direction as it leaves a Lambertian surface."""
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(3, 400_000)
-    point, d = entries(_global_lines(globe, sampler))
+    point, d = entries(_global_lines(GLOBE, sampler, 400_000)[0])
     place, direction = on_sphere(point), on_hemisphere(d, -point)
     assert_uniform(place, direction, bins=32)
     assert_uniform(np.concatenate([place, direction], axis=1), bins=8)
@@ -145,7 +142,7 @@ def gathered(monkeypatch):
             patch_of_point,
             coarse.cell_of_point,
             SAMPLES,
-            seed << 16,
+            seed=seed << 16,
         )
     d, pdf = (np.concatenate(values) for values in zip(*seen, strict=True))
     return d.reshape(-1, SAMPLES, 3), pdf.reshape(-1, SAMPLES)
@@ -172,8 +169,8 @@ def test_rotated_points_are_uniform(n_patches):
     points = []
     for k, seed in ((0, 1), (5, 1 << 16), (31, 7)):
         lattice = mi.Float(k / 32), mi.radical_inverse_2(mi.UInt32(k), 0)
-        for x, y in (lattice, (mi.Float(k * irradiance.R2[0]), mi.Float(k * irradiance.R2[1]))):
-            points.append(irradiance._rotated(x, y, rank, seed).numpy().T)
+        for x, y in (lattice, (mi.Float(k * gather.R2[0]), mi.Float(k * gather.R2[1]))):
+            points.append(gather._rotated(x, y, rank, seed).numpy().T)
     assert_uniform(*points, bins=16)
 
 

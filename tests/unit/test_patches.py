@@ -74,7 +74,8 @@ SCENES = {
 
 def share_found(coarse: CoarseMesh) -> np.ndarray:
     """Share of new surface points that have a patch, by object."""
-    points = scatter_points(coarse.scene, coarse.object_ids, 32 * BUDGET, seed=7)
+    sensors = coarse.scene.sensors()
+    points = scatter_points(coarse.scene, coarse.object_ids, 32 * BUDGET, sensors, seed=7)
     found = coarse.find(points)[-1]
     n_points = np.bincount(points.object_id, minlength=coarse.object_ids.count)
     return np.bincount(points.object_id, found, len(n_points)) / np.maximum(n_points, 1)
@@ -103,7 +104,8 @@ def test_surface_points_find_their_patch_again(name):
 def test_points_that_sensors_see_have_patches():
     """With as many points as the pre-passes scatter."""
     coarse = coarse_mesh(load(room()), BUDGET, points_per_patch=POINTS_PER_PATCH)
-    points = scatter_points(coarse.scene, coarse.object_ids, 32 * BUDGET, seed=7)
+    sensors = coarse.scene.sensors()
+    points = scatter_points(coarse.scene, coarse.object_ids, 32 * BUDGET, sensors, seed=7)
     found = coarse.find(points.take(np.flatnonzero(points.seen)))[-1]
     assert found.mean() > 0.95
 

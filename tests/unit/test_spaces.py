@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from envmap_integrator.radiosity.patch_points import only_standing
 from envmap_integrator.radiosity.spaces import find_spaces, separate
 from tests.helpers import at, block, box, camera, grey
 from tests.unit.kit import coarse_mesh, scene_of
@@ -32,6 +33,8 @@ def rooms(*places: float, gap: float = 0.0, contents=()):
     }
     scene = scene_of(*(shape | {"bsdf": PAINT} for shape in shapes), **sensors)
     coarse = coarse_mesh(scene, BUDGET)
+    patch_of_point = only_standing(coarse.points, coarse.patches, coarse.patch_of_point)
+    coarse = replace(coarse, patch_of_point=patch_of_point)
     return coarse, find_spaces(scene, coarse.points, coarse.patch_of_point)
 
 
@@ -116,10 +119,14 @@ def test_no_patch_is_looked_up_from_the_other_room():
 
 
 @pytest.mark.parametrize("places", [(-1,), (-1, 1)])
-def test_in_a_single_space_all_patches_that_sensors_see_remain(places):
+def test_in_a_single_space_patches_that_sensors_see_remain(places):
+    """But for those of which a part may lie in another, as nothing on a walk sees it."""
     coarse, space = rooms(*places, gap=0.3)
     seen = coarse.points.seen > 0
-    assert np.array_equal(separated(coarse, space)[1][seen], coarse.patch_of_point[seen])
+    before, after = coarse.patch_of_point, separated(coarse, space)[1]
+    in_doubt = np.isin(before, before[(before >= 0) & (space < 0)])
+    assert np.array_equal(after[seen & ~in_doubt], before[seen & ~in_doubt])
+    assert (after[seen] >= 0).mean() > 0.95
 
 
 def test_patches_that_no_sensor_comes_to_are_dropped():

@@ -1,0 +1,120 @@
+"""The error that the irradiance cache states of itself."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from envmap_integrator.radiosity.gather import block_mean, gather
+from envmap_integrator.radiosity.irradiance import solve_irradiance
+from envmap_integrator.radiosity.noise import TARGET, Noise
+from envmap_integrator.radiosity.patch_points import PatchPoints
+from envmap_integrator.rendering.source_choice import Emitters, by_weight
+from envmap_integrator.rendering.transport import Transport
+from tests.helpers import at, box, camera, emitting, grey, load, room
+from tests.unit.kit import coarse_mesh
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+BUDGET, SAMPLES = 512, 16
+
+
+def behind_a_wall() -> mi.Scene:
+    """A room whose lamp shines on the other side of a wall with a gap at one end."""
+    place = at(0.1, 0.4, 0) @ mi.ScalarTransform4f().rotate([0, 1, 0], 90).scale([2.1, 2.1, 1])
+    wall = {"type": "rectangle", "to_world": place, "bsdf": {"type": "twosided"} | grey(0.5)}
+    sensor = camera(origin=(1.5, -1.0, 0), target=(1, 1.5, -1))
+    lamp = {"type": "sphere", "center": [-1.8, 1.0, 0], "radius": 0.1} | grey(0) | emitting(50)
+    return load(
+        {"type": "scene", "walls": box(2.0) | grey(0.5), "wall": wall, "lamp": lamp}
+        | {"sensor": sensor}
+    )
+
+
+def solutions(scene: mi.Scene, more_rays: int = 0, count: int = 16):
+    """Brightness of what the sensor sees, and the stated error, of caches by other rays.
+
+    What is seen gathers light by rays of its own, always the same, which end in the cache.
+    """
+    coarse = coarse_mesh(scene, BUDGET, points_per_patch=32)
+    transport = Transport(coarse.patches, coarse.object_ids, by_weight(Emitters(scene)))
+    members = PatchPoints(coarse.points, coarse.patch_of_point, coarse.patches.count)
+    patches = np.arange(len(members.patches))
+    rays = gather(scene, transport, members, coarse.cell_of_point, patches, 1024, seed=7)
+    seen = (coarse.points.seen > 0) & (coarse.points.bounce == 0) & (coarse.patch_of_point >= 0)
+    share = np.bincount(coarse.patch_of_point[seen], minlength=coarse.patches.count)
+    share = share[members.patches] / share.sum()
+    own = (rays.direct + rays.escaped).numpy().mean(axis=0)
+
+    brightness, stated = [], []
+    for seed in range(count):
+        solution = solve_irradiance(
+            scene,
+            transport,
+            coarse.points,
+            coarse.patch_of_point,
+            coarse.cell_of_point,
+            SAMPLES,
+            more_rays,
+            seed=1 << 20 | seed << 12,
+        )
+        arriving = rays.weight * solution.cache.irradiance(rays.row)
+        arriving = block_mean(dr.mean(arriving), rays.samples).numpy()
+        brightness.append(share @ (own + arriving))
+        stated.append(solution.noise)
+    return np.array(brightness), np.array(stated)
+
+
+@pytest.mark.parametrize("scene", [lambda: load(room()), behind_a_wall], ids=["room", "gap"])
+def test_caches_scatter_as_they_state(scene):
+    brightness, stated = solutions(scene())
+    scatter = brightness.std(ddof=1) / brightness.mean()
+    assert scatter / 2 < stated.mean() < 2 * scatter
+
+
+def test_more_rays_lower_the_error_without_a_bias():
+    few, stated_of_few = solutions(behind_a_wall())
+    many, stated_of_many = solutions(behind_a_wall(), more_rays=1 << 18)
+    assert stated_of_few.mean() > 2 * TARGET
+    assert stated_of_many.mean() < 0.6 * stated_of_few.mean()
+    assert many.std() < 0.75 * few.std()
+    error = np.hypot(few.std(ddof=1), many.std(ddof=1)) / np.sqrt(len(few))
+    assert abs(few.mean() - many.mean()) < 3 * error
+
+
+# ---------------------- Where rays are sent ----------------------
+
+
+def noise(relative_error: float) -> Noise:
+    """Of four patches, the last of which hasn't found anything."""
+    return Noise(
+        relative_error=relative_error,
+        scatter=np.array([1.0, 2.0, 3.0, 0.0]) * relative_error,
+        stake=np.array([1.0, 1.0, 1.0, 4.0]),
+        count=np.ones(4, dtype=np.int64),
+        escaped_share=np.zeros(4),
+    )
+
+
+def test_rays_go_where_they_lower_the_error():
+    wanted = noise(0.1).blocks_wanted(most=500, samples=16)
+    assert 500 <= wanted.sum() <= 504
+    assert wanted[0] < wanted[1] < wanted[2]
+    assert wanted[3] > 10
+
+
+def test_no_more_rays_are_sent_than_the_error_asks_for():
+    assert not noise(TARGET).blocks_wanted(most=1000, samples=16).any()
+    few = noise(2 * TARGET).blocks_wanted(most=1 << 20, samples=1)
+    twice = replace(noise(2 * TARGET), scatter=2 * noise(2 * TARGET).scatter)
+    assert twice.blocks_wanted(most=1 << 20, samples=1).sum() > 3 * few.sum()
+
+
+def test_every_patch_gets_new_rays():
+    """Those that have asked for them don't count any longer."""
+    silent = replace(noise(0.1), stake=np.array([1.0, 1.0, 1.0, 0.0]))
+    assert silent.blocks_wanted(most=1000, samples=16)[3] == 1

@@ -1,0 +1,64 @@
+"""Which views a coarse mesh serves."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from envmap_integrator.radiosity.views import UNKNOWN, Service, service, usual_service, view_name
+from tests.helpers import box, camera, grey, load, room
+from tests.unit.kit import coarse_mesh, scene_of
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def test_a_view_is_named_by_where_it_looks():
+    here, again, there = (mi.load_dict(camera(origin=(x, -1.8, 0.4))) for x in (0.0, 0.0, 0.1))
+    assert view_name(here) == view_name(again) != view_name(there)
+    parameters = mi.traverse(again)
+    parameters["x_fov"] = 30.0
+    parameters.update()
+    assert view_name(here) != view_name(again)
+
+
+def test_a_view_of_the_same_room_is_served():
+    coarse = coarse_mesh(load(room()), 1024, points_per_patch=32)
+    usual = usual_service(coarse.points, coarse.patch_of_point)
+    assert usual.found > 0.9 and usual.patches > 100
+    for origin in ((0.5, -1.7, 0.6), (-1.5, 1.5, 1.0)):
+        other = mi.load_dict(camera(origin=origin))
+        found = service(coarse.scene, coarse.object_ids, coarse.patches, other)
+        assert found.suffices(usual)
+
+
+def test_a_view_of_another_room_is_not():
+    far = box(2.0) | {"to_world": mi.ScalarTransform4f().translate([10, 0, 0]).scale(2)} | grey(0.5)
+    coarse = coarse_mesh(load(room(other=far)), 1024, points_per_patch=32)
+    usual = usual_service(coarse.points, coarse.patch_of_point)
+    other = mi.load_dict(camera(origin=(10, -1.8, 0.4), target=(10, 0.5, -1)))
+    found = service(coarse.scene, coarse.object_ids, coarse.patches, other)
+    assert found.found < 0.1
+    assert not found.suffices(usual)
+
+
+def test_patches_too_large_for_a_view_do_not_serve_it():
+    assert Service(0.95, 500).suffices(Service(0.96, 1000))
+    assert not Service(0.95, 200).suffices(Service(0.96, 1000))
+    assert not Service(0.90, 1000).suffices(Service(0.96, 1000))
+
+
+def test_a_mesh_made_for_no_view_serves_none():
+    coarse = coarse_mesh(scene_of(box(2.0) | grey(0.5)), 256)
+    usual = usual_service(coarse.points, coarse.patch_of_point)
+    assert usual == UNKNOWN
+    sensor = mi.load_dict(camera())
+    assert not service(coarse.scene, coarse.object_ids, coarse.patches, sensor).suffices(usual)
+
+
+def test_a_view_that_asks_for_nothing_is_served():
+    coarse = coarse_mesh(load(room()), 256)
+    away = mi.load_dict(camera(origin=(0, -30, 0), target=(0, -60, 0)))
+    found = service(coarse.scene, coarse.object_ids, coarse.patches, away)
+    assert found.suffices(usual_service(coarse.points, coarse.patch_of_point))
+    assert np.isinf(found.patches)
