@@ -1,0 +1,67 @@
+"""Hits nearer than about the size of a patch aren't served by the coarse mesh."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from envmap_integrator.radiosity.irradiance import IrradianceCache
+from envmap_integrator.rendering.source_choice import Emitters, by_weight
+from envmap_integrator.rendering.transport import PathState, Transport, follow
+from tests.helpers import box, grey
+from tests.unit.kit import coarse_mesh, scene_of, surface_points
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+ALBEDO, WALL = 0.5, 2.0
+
+
+def found(distance: float, primary: bool = False, n: int = 1 << 14) -> float:
+    """Radiance along rays to the middle of a wall, of what has irradiance π everywhere.
+
+    They come from a surface that is so many patches away, or from a sensor there.
+    """
+    scene = scene_of(box(WALL) | grey(ALBEDO), sky={"type": "constant"})
+    coarse = coarse_mesh(scene, 512, points_per_patch=64)
+    table = dr.full(mi.Float, dr.pi, 2 * coarse.patches.count * len(mi.Spectrum()))
+    transport = Transport(
+        coarse.patches,
+        coarse.object_ids,
+        by_weight(Emitters(scene)),
+        gather_depth=0 if primary else 1,
+        cache=IrradianceCache(coarse.patches, table),
+    )
+    place = surface_points(np.array([[0.01, 0.02, -WALL]]), [0, 0, 1])
+    size = float(coarse.find(place)[1][0])
+
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, n)
+    origin = dr.zeros(mi.Interaction3f, n)
+    origin.p = mi.Point3f(0.01, 0.02, -WALL + distance * size)
+    start = PathState(
+        ray=mi.Ray3f(origin.p, mi.Vector3f(0, 0, -1)),
+        depth=mi.UInt32(0 if primary else 1),
+        origin=origin,
+        source_row=mi.UInt32(0),
+        pdf=mi.Float(dr.inv_pi),
+        specular=mi.Bool(primary),
+        bounded=mi.Bool(False),
+        cluster=mi.UInt32(0),
+        reach=mi.Float(dr.inf),
+        primary=primary,
+    )
+    end = follow(scene, transport, sampler, start, dr.full(mi.Bool, True, n))
+    return float(end.radiance.numpy().mean())
+
+
+@pytest.mark.parametrize(("distance", "served"), [(0.2, 0.0), (1.0, 0.5), (3.0, 1.0)])
+def test_hits_at_contacts_are_not_served(distance, served):
+    """At one patch's size it's one in two, at random: no border shows."""
+    expected = served * ALBEDO + (1 - served) * ALBEDO**2
+    assert found(distance) == pytest.approx(expected, rel=0.05)
+
+
+def test_a_sensor_is_no_surface():
+    assert found(0.2, primary=True) == pytest.approx(ALBEDO, rel=0.05)
