@@ -154,7 +154,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
         return self._prepared[settings, name]
 
     def _keep(self, settings: Settings, view: str, state: Prepared) -> None:
-        """Remember which state serves a view, and forget those that haven't been used for long."""
+        """Remember which state serves a view, and forget the oldest of many states."""
         self._prepared[settings, view] = state
         states = list({id(state): state for state in self._prepared.values()}.values())
         for old in states[:-MOST_STATES]:
