@@ -42,6 +42,8 @@ STEPS_PER_OCTAVE = 2
 GATHER_SHARE, MOST_PATCH_SAMPLES = 1 / 16, 256
 #: Gather rays that may be added for each camera sample, and at least and at most in all.
 MORE_SHARE, LEAST_MORE, MOST_MORE = 1 / 4, 1 << 21, 1 << 23
+#: How often patches that turn out to be too large are halved.
+MOST_DIVISIONS = 2
 #: Surface points per patch of the budget.
 POINTS_PER_PATCH = 24
 #: Memory [bytes] taken at most by a patch of the budget, by each of its gather rays, and by each of
@@ -146,33 +148,42 @@ def prepare(
     times: dict[str, float] = {}
 
     with _timed(times, "coarse mesh"):
-        object_ids = ObjectIds(scene)
+        object_ids, emitters = ObjectIds(scene), Emitters(scene)
         points = scatter_points(
             scene, object_ids, POINTS_PER_PATCH * settings.patches, sensors, settings.map_mirrors
         )
-        patches, patch_of_point, cell_of_point = build_patches(points, object_ids, settings.patches)
-        patch_of_point = only_standing(points, patches, patch_of_point)
-        space = find_spaces(scene, points, patch_of_point)
-        patches, patch_of_point, cell_of_point = separate(
-            scene, object_ids, patches, points, patch_of_point, cell_of_point, space
-        )
+    divided = None
+    for divisions in range(MOST_DIVISIONS + 1):
+        with _timed(times, "coarse mesh"):
+            patches, patch_of_point, cell_of_point = build_patches(
+                points, object_ids, settings.patches, divided
+            )
+            patch_of_point = only_standing(points, patches, patch_of_point)
+            space = find_spaces(scene, points, patch_of_point)
+            patches, patch_of_point, cell_of_point = separate(
+                scene, object_ids, patches, points, patch_of_point, cell_of_point, space
+            )
 
-    with _timed(times, "direct light"):
-        emitters = Emitters(scene)
-        light = survey_direct_light(scene, emitters, points, patch_of_point, patches.count)
-        sources = choose_sources(emitters, light, points, cell_of_point, patches)
-        patches, patch_of_point = sort_out_uneven(light, patches, patch_of_point)
+        with _timed(times, "direct light"):
+            light = survey_direct_light(scene, emitters, points, patch_of_point, patches.count)
+            sources = choose_sources(emitters, light, points, cell_of_point, patches)
+            patches, patch_of_point = sort_out_uneven(light, patches, patch_of_point)
 
-    with _timed(times, "irradiance cache"):
-        solution = solve_irradiance(
-            scene,
-            Transport(patches, object_ids, sources),
-            points,
-            patch_of_point,
-            cell_of_point,
-            settings.patch_samples,
-            settings.more_rays,
-        )
+        with _timed(times, "irradiance cache"):
+            solution = solve_irradiance(
+                scene,
+                Transport(patches, object_ids, sources),
+                points,
+                patch_of_point,
+                cell_of_point,
+                settings.patch_samples,
+                settings.more_rays,
+                may_divide=divisions < MOST_DIVISIONS,
+            )
+        if not solution.steep.any():
+            break
+        divided = solution.steep.astype(int) + (0 if divided is None else divided)
+
     prepared = Prepared(
         key,
         solution.cache,
@@ -180,7 +191,7 @@ def prepare(
         sources.row_of_cell,
         tuple(map(view_name, sensors)),
         usual_service(points, patch_of_point),
-        solution.noise,
+        solution.relative_error,
         stage_times=times,
     )
     if not settings.maps:
@@ -229,7 +240,7 @@ def _timed(times: dict[str, float], name: str):
     begin = time.perf_counter()
     yield
     dr.sync_thread()
-    times[name] = time.perf_counter() - begin
+    times[name] = times.get(name, 0.0) + time.perf_counter() - begin
 
 
 # ---------------------- Files ----------------------

@@ -17,6 +17,7 @@ from ..jit import mean_channel, mix, unit, upload
 from ..progress import stage
 from .direct_light import finite, sample_irradiance
 from .patch_points import PatchPoints
+from .patches import PARTS
 
 if TYPE_CHECKING:
     from ..rendering.transport import Transport
@@ -26,7 +27,7 @@ R2 = (0.7548776662466927, 0.5698402909980532)
 #: Gather rays per kernel launch: bounds memory.
 MAX_LANES = 1 << 22
 #: Floats that gather rays leave, and the iteration for them.
-FLOATS_PER_RAY = 14
+FLOATS_PER_RAY = 16
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,7 @@ class GatherRays:
     of_sources, of_others [N * B]  W/m²: the same of each ray, mean of the colour channels
     weight           [N * B]  throughput with which a ray ends in a patch,
     row              [N * B]  ... and the row of the irradiance table that it ends in
+    start, place     [N * B]  places where it starts and where it ends (``PathEnd.place``)
     """
 
     rank: np.ndarray
@@ -48,6 +50,8 @@ class GatherRays:
     of_others: mi.Float
     weight: mi.Spectrum
     row: mi.UInt32
+    start: mi.UInt32
+    place: mi.UInt32
 
     def __len__(self) -> int:
         """Number of blocks B."""
@@ -109,14 +113,19 @@ def gather(
     of two.
     """
     cells = upload(mi.UInt32, cell_of_point[members.index[members.first[:-1]]])
+    position, normal, object_id = members.points.places()
+    _, size, _ = transport.patches.find_cell(position, normal, object_id)
+    parts = transport.patches.part(position, size)
+    dr.eval(parts)
     launch = max(MAX_LANES // samples, 1)
-    parts = []
+    found = []
     with stage("Gathering irradiance", total=len(rank)) as advance:
         for begin in range(0, len(rank), launch):
             some = rank[begin : begin + launch]
-            parts.append(_gather(scene, transport, members, cells, some, samples, seed + 1 + begin))
+            seed_ = seed + 1 + begin
+            found.append(_gather(scene, transport, members, parts, cells, some, samples, seed_))
             advance(len(some))
-    return GatherRays.concatenate(parts)
+    return GatherRays.concatenate(found)
 
 
 def block_mean(value: mi.Spectrum | mi.Float, samples: int):
@@ -126,7 +135,7 @@ def block_mean(value: mi.Spectrum | mi.Float, samples: int):
     return type(value)(*(dr.block_sum(c, samples) / samples for c in value))
 
 
-def _gather(scene, transport, members, cells, rank, samples, seed) -> GatherRays:
+def _gather(scene, transport, members, parts, cells, rank, samples, seed) -> GatherRays:
     from ..rendering.transport import PathState, follow, mis_weight
 
     n_lanes = len(rank) * samples
@@ -138,6 +147,8 @@ def _gather(scene, transport, members, cells, rank, samples, seed) -> GatherRays
     k = lane & (dr.opaque(mi.UInt32, samples) - 1)
     point = members.sample(member, sampler.next_1d())
     si = members.points.interaction(point)
+    patch = dr.gather(mi.UInt32, upload(mi.UInt32, members.patches), member)
+    start_place = PARTS * patch + dr.gather(mi.UInt32, parts, point)
 
     # ---- Low-discrepancy numbers, rotated at random for each block (Cranley-Patterson) ----
     u = _rotated(
@@ -184,11 +195,13 @@ def _gather(scene, transport, members, cells, rank, samples, seed) -> GatherRays
     direct, escaped, weight = (each(finite, scale * x) for x in (direct, escaped, end_.weight))
     of_sources, of_others = mean_channel(direct), mean_channel(escaped)
     # Block sums evaluate what they sum up: without this, each of them would trace all rays anew.
-    dr.eval(direct, escaped, of_sources, of_others, weight, end_.row)
+    dr.eval(direct, escaped, of_sources, of_others, weight, end_.row, end_.place, start_place)
     weight *= dr.repeat(_excess(weight, samples), samples)
     direct, escaped = block_mean(direct, samples), block_mean(escaped, samples)
     dr.eval(direct, escaped, weight)
-    return GatherRays(rank, direct, escaped, of_sources, of_others, weight, end_.row)
+    return GatherRays(
+        rank, direct, escaped, of_sources, of_others, weight, end_.row, start_place, end_.place
+    )
 
 
 def _excess(weight: mi.Spectrum, samples: int) -> mi.Float:

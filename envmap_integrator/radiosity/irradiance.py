@@ -57,14 +57,16 @@ class Solution:
     """The irradiance cache, and what is known of it.
 
     cache           the irradiance
-    noise           relative standard error [1] that it leaves in the brightness of the picture
+    relative_error  [1]  that it leaves in the brightness of the picture
     escaped_share   [P]  what part of the second moment of the indirect light that a patch's rays
                     bring has come from no patch but through mirrors and glass, or off what has none
+    steep           [C]  large cells whose patches must be smaller first: the solution is a sketch
     """
 
     cache: IrradianceCache
-    noise: float
+    relative_error: float
     escaped_share: np.ndarray
+    steep: np.ndarray
 
 
 def solve_irradiance(
@@ -75,12 +77,14 @@ def solve_irradiance(
     cell_of_point: np.ndarray,
     samples: int,
     more_rays: int = 0,
+    may_divide: bool = False,
     seed: int = 0,
 ) -> Solution:
     """Gather and solve for the irradiance of every patch.
 
     ``samples`` rays start from each patch, a power of two, and up to about ``more_rays`` where the
-    picture's error hangs on them. With E_d the direct and E_i the indirect irradiance,
+    picture's error hangs on them. If patches turn out to be too large, and ``may_divide``, it ends
+    there. With E_d the direct and E_i the indirect irradiance,
     b the light that gather rays find outside the patches, and w the throughput with which they
     end in patch j, the solution fulfils E_i = mean(π b + w E(j)), where E(j) is E_d + E_i or E_i.
     """
@@ -89,7 +93,9 @@ def solve_irradiance(
     n_channels, n_used = len(mi.Spectrum()), len(members.patches)
     if n_used == 0:  # Nothing but mirrors and glass.
         table = dr.zeros(mi.Float, 2 * n_patches * n_channels)
-        return Solution(IrradianceCache(transport.patches, table), 0.0, np.zeros(n_patches))
+        no_cell = np.zeros(dr.width(transport.patches.levels), dtype=bool)
+        cache = IrradianceCache(transport.patches, table)
+        return Solution(cache, 0.0, np.zeros(n_patches), no_cell)
 
     def send(rank, seed):
         return gather(scene, transport, members, cell_of_point, rank, samples, seed)
@@ -100,7 +106,8 @@ def solve_irradiance(
         blocks = Blocks(rank, n_used)
         cache = IrradianceCache(transport.patches, _solve(n_patches, members.patches, rays, blocks))
         noise = cache_noise(rays, blocks, cache, members, cell_of_point)
-        if further == len(MORE):
+        steep = noise.steep & may_divide
+        if further == len(MORE) or steep.any():
             break
         # The rays that asked for others don't count any longer: patches whose rays happened to miss
         # the light would stay dark while the lucky ones are put right.
@@ -113,7 +120,7 @@ def solve_irradiance(
     n_rays = dr.width(rays.row)
     del rays
     give_back(FLOATS_PER_RAY * n_rays)
-    return Solution(cache, noise.relative_error, escaped_share)
+    return Solution(cache, noise.error, escaped_share, steep)
 
 
 def _solve(n_patches: int, patch: np.ndarray, rays: GatherRays, blocks: Blocks) -> mi.Float:

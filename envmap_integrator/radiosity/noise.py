@@ -17,6 +17,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from ..jit import mean_channel, upload
+from .coarseness import Coarseness, coarseness
 from .gather import Blocks, GatherRays
 from .patch_points import PatchPoints
 
@@ -36,7 +37,8 @@ ADJOINT_RAYS, CONVERGED, MAX_BOUNCES = 32, 1e-3, 64
 class Noise:
     """What the picture owes to the chance of gather rays.
 
-    relative_error   [1]  standard error of the picture's brightness, over that brightness
+    chance           [1]  standard error of the picture's brightness, over that brightness
+    coarseness            what the size of the patches adds to it
     scatter          [K]  what a single ray of each patch adds to that error, root mean square over
                           the patch's surroundings
     stake            [K]  share of the picture's brightness that passes through the patch, likewise
@@ -44,11 +46,23 @@ class Noise:
     escaped_share    [K]  see ``Solution``
     """
 
-    relative_error: float
+    chance: float
+    coarseness: Coarseness
     scatter: np.ndarray
     stake: np.ndarray
     count: np.ndarray
     escaped_share: np.ndarray
+
+    @property
+    def error(self) -> float:
+        """Relative error [1] of the picture's brightness, by chance and by the size of patches."""
+        return float(np.sqrt(self.chance**2 + self.coarseness.squared_error))
+
+    @property
+    def steep(self) -> np.ndarray:
+        """Large cells [C] whose patches must be smaller, lest the picture be wrong."""
+        coarse = self.coarseness
+        return coarse.steep & (abs(coarse.steep_bias) > max(TARGET, coarse.doubt))
 
     def blocks_wanted(self, most: int, samples: int) -> np.ndarray:
         """How many new blocks [K] of ``samples`` rays each patch should have, ``most`` in all.
@@ -59,7 +73,7 @@ class Noise:
         need.
         """
         total = self.scatter.sum()
-        if self.relative_error <= TARGET or total == 0:
+        if self.chance <= TARGET or total == 0:
             return np.zeros(len(self.count), dtype=np.int64)
         needed = min((total / TARGET) ** 2 / samples, most)
         share = self.scatter / total + STAKE * self.stake / max(self.stake.sum(), 1e-30)
@@ -75,14 +89,21 @@ def cache_noise(
 ) -> Noise:
     """Find out how uncertain a cache is that was solved from ``blocks`` of ``rays``."""
     samples, rank = rays.samples, blocks.rank
-    irradiance = cache.table.numpy().reshape(-1, 2, len(mi.Spectrum())).mean(axis=2)
-    irradiance = irradiance[members.patches, 0]
+    table = cache.table.numpy().reshape(-1, len(mi.Spectrum())).mean(axis=1)
+    irradiance = table[2 * members.patches]
     seen = _first_seen(members)
     brightness = max(float(seen @ irradiance), 1e-30)
-    total, indirect = _importance(rays, blocks, cache, members, seen / brightness)
+    seen /= brightness
+    total, indirect = _importance(rays, blocks, cache, members, seen)
+    n_cells = dr.width(cache.patches.levels)
+    of_patches = mean_channel(rays.weight * cache.irradiance(rays.row))
+    dr.eval(of_patches)
+    # What is seen first gathers by rays of its own, as if it were patches.
+    importance = indirect + seen
+    arriving = of_patches.numpy()
+    coarse = coarseness(rays, blocks, table, arriving, importance, members, cell_of_point, n_cells)
 
     # ---- Scatter of each block: rays k and k ^ step start in neighbouring directions ----
-    of_patches = mean_channel(rays.weight * cache.irradiance(rays.row))
     others = rays.of_others + of_patches
     per_ray = (
         dr.repeat(upload(mi.Float, importance[rank]), samples) for importance in (total, indirect)
@@ -106,7 +127,8 @@ def cache_noise(
     squares = (_block_sum(dr.square(x), samples) for x in (rays.of_others, of_patches))
     escaped, patched = (np.bincount(rank, x * share) for x in squares)
     return Noise(
-        relative_error=float(np.sqrt(variance.sum())),
+        chance=float(np.sqrt(variance.sum())),
+        coarseness=coarse,
         scatter=np.sqrt(around(variance * blocks.count * samples)),
         stake=around(indirect * irradiance),
         count=blocks.count,

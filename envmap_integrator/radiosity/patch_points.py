@@ -8,11 +8,11 @@ import numpy as np
 from scipy.sparse import coo_matrix
 
 from ..jit import upload
-from .patches import Patches
+from .patches import PARTS, Patches
 from .surface_points import SurfacePoints
 
-#: Parts of a patch along each axis in which rays start equally often.
-PARTS = 4
+#: Parts of the box about a patch's points along each axis in which rays start equally often.
+STRATA = 4
 
 
 class PatchPoints:
@@ -36,7 +36,7 @@ class PatchPoints:
         order = np.argsort(key, kind="stable")
         self.index = by_patch.data[order]
         part, first_of_part = np.unique(key[order], return_index=True)
-        first_part = np.searchsorted(part, PARTS**3 * np.arange(len(self.patches) + 1))
+        first_part = np.searchsorted(part, STRATA**3 * np.arange(len(self.patches) + 1))
         self._first_part = upload(mi.UInt32, first_part)
         self._first_of_part = upload(mi.UInt32, np.append(first_of_part, len(key)))
         self._index = upload(mi.UInt32, self.index)
@@ -50,8 +50,8 @@ class PatchPoints:
         rank = key
         for x in position.T.astype(np.float64):
             low, high = (f.reduceat(x, first)[rank] for f in (np.minimum, np.maximum))
-            slice_ = (x - low) * (PARTS / np.maximum(high - low, np.finfo(np.float32).tiny))
-            key = PARTS * key + np.minimum(slice_.astype(np.int64), PARTS - 1)
+            slice_ = (x - low) * (STRATA / np.maximum(high - low, np.finfo(np.float32).tiny))
+            key = STRATA * key + np.minimum(slice_.astype(np.int64), STRATA - 1)
         return key
 
     def sample(self, rank: mi.UInt32, u: mi.Float) -> mi.UInt32:
@@ -83,12 +83,12 @@ def only_standing(
     it: global lines also hit what no light reaches, such as the floor under a cupboard, which would
     darken what looks out.
     """
+    if len(points) == 0:  # Nothing but mirrors and glass.
+        return patch_of_point
     place = points.places()
     _, size, _ = patches.find_cell(*place)
-    quarter = dr.floor((place[0] - patches.origin) * (2 / size))
-    quarter = mi.Vector3u(mi.Vector3i(quarter) & 1)
-    part = 8 * patch_of_point + (quarter.x + 2 * quarter.y + 4 * quarter.z).numpy()
+    part = PARTS * patch_of_point + patches.part(place[0], size).numpy()
     has_patch, seen = patch_of_point >= 0, points.seen > 0
-    visited = np.zeros(8 * patches.count, dtype=bool)
+    visited = np.zeros(PARTS * patches.count, dtype=bool)
     visited[part[has_patch & seen]] = True
     return np.where(has_patch & (seen | ~visited[part]), patch_of_point, -1)

@@ -24,13 +24,16 @@ LARGE_CELL = 1 / 32
 MAX_LEVEL = 12
 #: Points in a large cell from which on the box about them tells how much of it they fill.
 BOXED = 8
+#: Parts of a patch that are told apart: the octants of its cell.
+PARTS = 8
 #: Entries of a bucket of the hash tables, read by one packed gather.
 BUCKET = 4
 #: Bits of an entry that don't belong to the fingerprint: of the large cells' table, which hold the
 #: level, and of the patches'.
-_LEVEL_BITS, _MARK_BITS = 4, 2
-#: Marks of a patch: direct light is uneven over it, and it has been left out.
-_UNEVEN, _DROPPED = 1, 2
+_LEVEL_BITS, _MARK_BITS = 4, 2 + PARTS
+#: Marks of a patch: direct light is uneven over it, it has been left out, and the first of those of
+#: the parts of it that have surface points.
+_UNEVEN, _DROPPED, _KNOWN = 1, 2, 4
 
 
 @dataclass(frozen=True)
@@ -74,21 +77,24 @@ class Patches:
     def find(self, p, normal, object_id, size, active=True, u=None):
         """Look up the patch of an oriented surface point in a cell with patches of edge ``size``.
 
-        Returns ``(patch, found, even)``. Surfaces too small to have been hit have no patch; where
-        direct light isn't ``even``, the patch's irradiance stands for indirect light alone.
+        Returns ``(patch, found, even, own)``. Surfaces too small to have been hit have no patch,
+        nor do parts of a patch that no surface point lies in, such as those beyond a thin wall;
+        where direct light isn't ``even``, the patch's irradiance stands for indirect light alone.
+        ``own`` is the patch that the point itself lies in, meaningless if there is none.
 
         With ``u``, uniform in the unit square, the point is moved at random by up to half a patch
         along the surface: the expectation interpolates between patches, so their borders don't
         show. Where the moved point belongs to no patch (beyond an edge of the surface), the patch
-        of the point itself is taken; where that one has been left out, there is none.
+        of the point itself is taken; where that one isn't known or has been left out, there is
+        none.
         """
         level = mi.UInt32(dr.log2(self.size / size) + 0.5)
         identity = self._identity(normal, object_id)
         marks, exists, own = self._probe(self.cells, p, identity, level, _MARK_BITS, active)
-        dropped = exists & ((marks & _DROPPED) != 0)
-        found = exists & ~dropped
+        known = (marks >> (self.part(p, size) + 2)) & 1
+        found = exists & (known != 0) & ((marks & _DROPPED) == 0)
         if u is None:
-            return own, found, (marks & _UNEVEN) == 0
+            return own, found, (marks & _UNEVEN) == 0, own
 
         frame = mi.Frame3f(normal)
         moved = p + size * (frame.s * (u.x - 0.5) + frame.t * (u.y - 0.5))
@@ -96,13 +102,17 @@ class Patches:
         v = mi.Point2f(256 * u.x - dr.floor(256 * u.x), 256 * u.y - dr.floor(256 * u.y))
         tilted = normal + 0.4 * (frame.s * (v.x - 0.5) + frame.t * (v.y - 0.5))
         around = self._identity(tilted, object_id)
-        # What has been left out isn't served by its neighbours: it's unlike them.
-        entry, hit, patch = self._probe(
-            self.cells, moved, around, level, _MARK_BITS, active & ~dropped
-        )
+        # What isn't known or has been left out isn't served by its neighbours: it's unlike them.
+        entry, hit, patch = self._probe(self.cells, moved, around, level, _MARK_BITS, found)
         hit &= (entry & _DROPPED) == 0
         even = ((marks | dr.select(hit, entry, 0)) & _UNEVEN) == 0
-        return dr.select(hit, patch, own), found | hit, even
+        return dr.select(hit, patch, own), found, even, own
+
+    def part(self, p, size) -> mi.UInt32:
+        """Which of its parts a point lies in, in a patch of edge ``size``."""
+        half = dr.floor((p - self.origin) * (2 / size))
+        half = mi.Vector3u(mi.Vector3i(half) & 1)
+        return half.x + 2 * half.y + 4 * half.z
 
     def _identity(self, normal, object_id):
         """What tells patches in the same cell apart."""
@@ -155,10 +165,11 @@ def cell_hash(cell, identity, level):
 
 
 def build_patches(
-    points: SurfacePoints, object_ids: ObjectIds, budget: int
+    points: SurfacePoints, object_ids: ObjectIds, budget: int, divided: np.ndarray | None = None
 ) -> tuple[Patches, np.ndarray, np.ndarray]:
     """Build the coarse mesh over ``points`` with about ``budget`` patches.
 
+    ``divided`` tells how often each large cell [C] is divided beyond what its points suggest.
     Returns the patches and, of every point, the patch index and the large cell's [N], -1 where
     it has none.
     """
@@ -190,9 +201,13 @@ def build_patches(
     long, short = _filled(position, cell_of_point, n_points, size)
     edge = np.maximum(np.sqrt(long * short / n_patches), long / n_patches)
     level = np.round(-np.log2(np.clip(edge, 2.0**-MAX_LEVEL, 1)))
-    level = np.clip(level, 0, MAX_LEVEL).astype(np.uint64)
     payload = np.uint64((1 << _LEVEL_BITS) - 1)
-    levels, index_of_large = _hash_table((large & ~payload) | level)
+    levels, index_of_large = _hash_table(large & ~payload)
+    kept = index_of_large >= 0
+    if divided is not None:
+        level[kept] += divided[index_of_large[kept]]
+    level = np.clip(level, 0, MAX_LEVEL).astype(np.uint64)
+    levels[index_of_large[kept]] |= level[kept].astype(np.uint32)
     large_of_point = index_of_large[cell_of_point]
 
     # ---- Their cells are the patches ----
@@ -200,8 +215,15 @@ def build_patches(
     key = cell_keys(patches, position, identity, level_of_point)
     cells, cell_of_point = np.unique(key, return_inverse=True)
     cells, patch_of_cell = _hash_table(cells & ~np.uint64((1 << _MARK_BITS) - 1))
+    patch_of_point = patch_of_cell[cell_of_point]
+    edge = patches.size / mi.Float(mi.UInt32(1) << level_of_point)
+    part = patches.part(position, edge).numpy()
+    standing = patch_of_point >= 0
+    known = np.zeros(PARTS * len(cells), dtype=bool)
+    known[(PARTS * patch_of_point + part)[standing]] = True
+    cells |= _KNOWN * np.packbits(known, bitorder="little").astype(np.uint32)
     patches = replace(patches, levels=upload(mi.UInt32, levels), cells=upload(mi.UInt32, cells))
-    return patches, patch_of_cell[cell_of_point], large_of_point
+    return patches, patch_of_point, large_of_point
 
 
 def _filled(position, cell_of_point, n_points, size) -> np.ndarray:

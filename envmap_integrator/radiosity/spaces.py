@@ -148,7 +148,7 @@ def _looked_at(scene, object_ids, patches, si, space_of_patch, sampler, active) 
     hit = scene.ray_intersect(ray, active)
     normal, objects = dr.mulsign(hit.n, -dr.dot(hit.n, ray.d)), object_ids(hit)
     _, size, found = patches.find_cell(hit.p, normal, objects, active & hit.is_valid())
-    patch, found, _ = patches.find(hit.p, normal, objects, size, found)
+    patch, found, *_ = patches.find(hit.p, normal, objects, size, found)
     return dr.select(found, dr.gather(mi.UInt32, space_of_patch, patch, found), UNKNOWN)
 
 
@@ -177,7 +177,7 @@ def _look_around(scene, object_ids, patches, points, space, space_of_patch, seed
     frame = mi.Frame3f(si.n)
     p = si.p + size * (frame.s * (u.x - 0.5) + frame.t * (u.y - 0.5))
     cell, size, found = patches.find_cell(p, si.n, object_id, found)
-    patch, has_patch, _ = patches.find(p, si.n, object_id, size, found, sampler.next_2d())
+    patch, has_patch, *_ = patches.find(p, si.n, object_id, size, found, sampler.next_2d())
 
     other = dr.gather(mi.UInt32, space_of_patch, patch, has_patch) != own
     foreign = dr.zeros(mi.Bool, patches.count)

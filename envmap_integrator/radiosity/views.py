@@ -65,7 +65,7 @@ def service(scene: mi.Scene, object_ids: ObjectIds, patches: Patches, sensor: mi
         return Service(1.0, np.inf)  # Nothing is asked for.
     place = points.places()
     _, size, found = patches.find_cell(*place)
-    patch, found, _ = patches.find(*place, size, found)
+    patch, found, *_ = patches.find(*place, size, found)
     return _service(np.where(found.numpy(), patch.numpy().astype(np.int64), -1))
 
 

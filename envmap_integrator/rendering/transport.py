@@ -25,7 +25,7 @@ import mitsuba as mi
 from ..jit import SpareNumbers, mix, unit
 from ..maps.far_field import Cube, FarField
 from ..radiosity.irradiance import IrradianceCache
-from ..radiosity.patches import Patches
+from ..radiosity.patches import PARTS, Patches
 from ..radiosity.surface_points import ObjectIds
 from .ray_counts import Ray, count, count_secondary
 from .sample_points import LANES_ALIKE
@@ -141,6 +141,7 @@ class PathEnd:
     direct     [W/m²/sr]  the part of it that came from sources on the first ray
     weight     [1]        throughput times albedo at the patch the path ended in, 0 if none
     row        [1]        row of the irradiance table (2 * patch, + 1 for indirect light only)
+    place      [1]        where that was: PARTS * the patch of that very place + its part
     valid                 whether something was hit (alpha)
     distance   [m]        to the first hit, infinite if none
     """
@@ -149,6 +150,7 @@ class PathEnd:
     direct: mi.Spectrum
     weight: mi.Spectrum
     row: mi.UInt32
+    place: mi.UInt32
     valid: mi.Bool
     distance: mi.Float
 
@@ -210,6 +212,7 @@ def follow(
     direct = mi.Spectrum(0)
     weight = mi.Spectrum(0)
     row = mi.UInt32(0)
+    place = mi.UInt32(0)
     # As in path, a visible environment is never transparent.
     valid = start.solid | (
         active & (scene.environment() is not None and not transport.hide_emitters)
@@ -295,7 +298,9 @@ def follow(
         cell, size, found = patches.find_cell(si.p, normal, object_id, mapped)
         next_source_row = transport.sources.row(cell, found)
         deep = found & is_diffuse(bsdf) & (depth >= transport.gather_depth)
-        patch, has_patch, even = patches.find(si.p, normal, object_id, size, deep, spare.next_2d())
+        patch, has_patch, even, own = patches.find(
+            si.p, normal, object_id, size, deep, spare.next_2d()
+        )
         # A coarse mesh can't serve hits about as near as its patches are large (corners,
         # contacts). The threshold is random, so that no border shows.
         near = dr.norm(si.p - origin.p) < size * (0.5 + spare.next_1d())
@@ -349,6 +354,7 @@ def follow(
         if dr.hint(cache is None, mode="scalar"):
             weight[ends] = throughput * bsdf_weight
             row[ends] = cached_row
+            place[ends] = PARTS * own + patches.part(si.p, size)
         else:
             cached_weight = dr.select((served | residual_here) & wide, bsdf_weight, 0)
             several = (served | residual_here) & ~single_lobe(bsdf)
@@ -403,7 +409,7 @@ def follow(
         throughput[active] *= dr.rcp(survival)
         count_secondary(ray, bounded, retrace, active)
 
-    return PathEnd(radiance, direct, weight, row, valid, distance)
+    return PathEnd(radiance, direct, weight, row, place, valid, distance)
 
 
 def survival_probability(throughput, eta, bounces):

@@ -61,7 +61,7 @@ class CoarseMesh:
         )
         u = u if u is None else mi.Point2f(u.astype(np.float32))
         _, size, known = self.patches.find_cell(p, normal, object_id)
-        patch, found, _ = self.patches.find(p, normal, object_id, size, known, u)
+        patch, found, *_ = self.patches.find(p, normal, object_id, size, known, u)
         return patch.numpy(), size.numpy(), found.numpy()
 
     def solve(self, samples: int = 64) -> IrradianceCache:

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from envmap_integrator.radiosity.coarseness import Coarseness
 from envmap_integrator.radiosity.gather import block_mean, gather
 from envmap_integrator.radiosity.irradiance import solve_irradiance
 from envmap_integrator.radiosity.noise import TARGET, Noise
@@ -65,7 +66,7 @@ def solutions(scene: mi.Scene, more_rays: int = 0, count: int = 16):
         arriving = rays.weight * solution.cache.irradiance(rays.row)
         arriving = block_mean(dr.mean(arriving), rays.samples).numpy()
         brightness.append(share @ (own + arriving))
-        stated.append(solution.noise)
+        stated.append(solution.relative_error)
     return np.array(brightness), np.array(stated)
 
 
@@ -92,7 +93,8 @@ def test_more_rays_lower_the_error_without_a_bias():
 def noise(relative_error: float) -> Noise:
     """Of four patches, the last of which hasn't found anything."""
     return Noise(
-        relative_error=relative_error,
+        chance=relative_error,
+        coarseness=Coarseness(bias=0.0, doubt=0.0, steep=np.zeros(1, dtype=bool), steep_bias=0.0),
         scatter=np.array([1.0, 2.0, 3.0, 0.0]) * relative_error,
         stake=np.array([1.0, 1.0, 1.0, 4.0]),
         count=np.ones(4, dtype=np.int64),
