@@ -17,7 +17,7 @@ from scipy.sparse.linalg import LinearOperator, gmres
 from ..jit import give_back, upload
 from ..progress import stage
 from .gather import FLOATS_PER_RAY, Blocks, GatherRays, block_mean, gather
-from .noise import cache_noise
+from .noise import Noise, cache_noise
 from .patch_points import PatchPoints
 from .patches import Patches
 from .surface_points import SurfacePoints
@@ -57,16 +57,21 @@ class Solution:
     """The irradiance cache, and what is known of it.
 
     cache           the irradiance
-    relative_error  [1]  that it leaves in the brightness of the picture
+    noise           the error that it leaves in the brightness of pictures, None without patches
     escaped_share   [P]  what part of the second moment of the indirect light that a patch's rays
                     bring has come from no patch but through mirrors and glass, or off what has none
     steep           [C]  large cells whose patches must be smaller first: the solution is a sketch
     """
 
     cache: IrradianceCache
-    relative_error: float
+    noise: Noise | None
     escaped_share: np.ndarray
     steep: np.ndarray
+
+    @property
+    def relative_error(self) -> float:
+        """``Noise.error``; 0 without patches, as paths are traced to their end."""
+        return self.noise.error if self.noise else 0.0
 
 
 def solve_irradiance(
@@ -95,7 +100,7 @@ def solve_irradiance(
         table = dr.zeros(mi.Float, 2 * n_patches * n_channels)
         no_cell = np.zeros(dr.width(transport.patches.levels), dtype=bool)
         cache = IrradianceCache(transport.patches, table)
-        return Solution(cache, 0.0, np.zeros(n_patches), no_cell)
+        return Solution(cache, None, np.zeros(n_patches), no_cell)
 
     def send(rank, seed):
         return gather(scene, transport, members, cell_of_point, rank, samples, seed)
@@ -106,7 +111,7 @@ def solve_irradiance(
         blocks = Blocks(rank, n_used)
         cache = IrradianceCache(transport.patches, _solve(n_patches, members.patches, rays, blocks))
         noise = cache_noise(rays, blocks, cache, members, cell_of_point)
-        steep = noise.steep & may_divide
+        steep = noise.steep & (may_divide and further < len(MORE))
         if further == len(MORE) or steep.any():
             break
         # The rays that asked for others don't count any longer: patches whose rays happened to miss
@@ -120,7 +125,7 @@ def solve_irradiance(
     n_rays = dr.width(rays.row)
     del rays
     give_back(FLOATS_PER_RAY * n_rays)
-    return Solution(cache, noise.error, escaped_share, steep)
+    return Solution(cache, noise, escaped_share, steep)
 
 
 def _solve(n_patches: int, patch: np.ndarray, rays: GatherRays, blocks: Blocks) -> mi.Float:

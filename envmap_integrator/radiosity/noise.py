@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from ..jit import mean_channel, upload
+from ..jit import mean_channel
 from .coarseness import Coarseness, coarseness
 from .gather import Blocks, GatherRays
 from .patch_points import PatchPoints
@@ -37,7 +37,8 @@ ADJOINT_RAYS, CONVERGED, MAX_BOUNCES = 32, 1e-3, 64
 class Noise:
     """What the picture owes to the chance of gather rays.
 
-    chance           [1]  standard error of the picture's brightness, over that brightness
+    chance           [1]  standard error of a picture's brightness, over that brightness: of the
+                          sensor for which it is largest
     coarseness            what the size of the patches adds to it
     scatter          [K]  what a single ray of each patch adds to that error, root mean square over
                           the patch's surroundings
@@ -91,34 +92,34 @@ def cache_noise(
     samples, rank = rays.samples, blocks.rank
     table = cache.table.numpy().reshape(-1, len(mi.Spectrum())).mean(axis=1)
     irradiance = table[2 * members.patches]
-    seen = _first_seen(members)
-    brightness = max(float(seen @ irradiance), 1e-30)
-    seen /= brightness
-    total, indirect = _importance(rays, blocks, cache, members, seen)
+    views = _views(members, irradiance)
+    total, indirect = _importance(rays, blocks, cache, members, views)
     n_cells = dr.width(cache.patches.levels)
     of_patches = mean_channel(rays.weight * cache.irradiance(rays.row))
     dr.eval(of_patches)
     # What is seen first gathers by rays of its own, as if it were patches.
-    importance = indirect + seen
+    importance = (indirect + views).sum(axis=1)
     arriving = of_patches.numpy()
     coarse = coarseness(rays, blocks, table, arriving, importance, members, cell_of_point, n_cells)
 
     # ---- Scatter of each block: rays k and k ^ step start in neighbouring directions ----
-    others = rays.of_others + of_patches
-    per_ray = (
-        dr.repeat(upload(mi.Float, importance[rank]), samples) for importance in (total, indirect)
-    )
-    value = next(per_ray) * rays.of_sources + next(per_ray) * others
-    dr.eval(value)
     step = 1 << (samples.bit_length() - 1) // 2
+    sources, others = rays.of_sources, rays.of_others + of_patches
     if samples > 1:
-        lane = dr.arange(mi.UInt32, dr.width(value))
-        value -= dr.gather(mi.Float, value, lane ^ dr.opaque(mi.UInt32, step))
-    variance = 0.5 * _block_sum(dr.square(value), samples) / samples**2
+        lane = dr.arange(mi.UInt32, dr.width(others)) ^ dr.opaque(mi.UInt32, step)
+        dr.eval(others)
+        sources, others = (x - dr.gather(mi.Float, x, lane) for x in (sources, others))
+    products = sources * sources, others * others, 2 * sources * others
+    moments = (0.5 / samples**2 * _block_sum(x, samples)[:, None] for x in products)
+    t, i = total[rank], indirect[rank]
+    variance = sum(a * moment for a, moment in zip((t * t, i * i, t * i), moments, strict=True))
 
     # ---- By patch, and in its surroundings ----
     share = 1 / blocks.count[rank]
-    variance = np.bincount(rank, variance * share**2)
+    by_patch = csr_matrix((share**2, (rank, np.arange(len(rank)))), (len(blocks.count), len(rank)))
+    variance = by_patch @ variance
+    chance = np.sqrt(variance.sum(axis=0).max())
+    variance = variance.sum(axis=1)
     cell = np.unique(cell_of_point[members.index[members.first[:-1]]], return_inverse=True)[1]
 
     def around(values):
@@ -127,33 +128,41 @@ def cache_noise(
     squares = (_block_sum(dr.square(x), samples) for x in (rays.of_others, of_patches))
     escaped, patched = (np.bincount(rank, x * share) for x in squares)
     return Noise(
-        chance=float(np.sqrt(variance.sum())),
+        chance=float(chance),
         coarseness=coarse,
         scatter=np.sqrt(around(variance * blocks.count * samples)),
-        stake=around(indirect * irradiance),
+        stake=around(indirect.sum(axis=1) * irradiance),
         count=blocks.count,
         escaped_share=escaped / np.maximum(escaped + patched, 1e-30),
     )
 
 
-def _first_seen(members: PatchPoints) -> np.ndarray:
-    """What part [K] of the surface that sensors see first lies in each patch.
+def _views(members: PatchPoints, irradiance: np.ndarray) -> np.ndarray:
+    """By what part [K, S] the brightness of each sensor's picture grows with a patch's irradiance.
 
-    Without sensors, what part of all points.
+    The part that the sensor sees of it first, by what that reflects; the pictures are those of all
+    sensors that see light. Without sensors, there is one picture of all points.
     """
     points, n_patches = members.points, len(members.patches)
     rank = np.repeat(np.arange(n_patches), np.diff(members.first.astype(np.int64)))
-    first = (points.seen[members.index] > 0) & (points.bounce[members.index] == 0)
-    if not first.any():
-        first[:] = True
-    return np.bincount(rank[first], minlength=n_patches) / first.sum()
+    seen, reflects = points.seen[members.index], points.reflects[members.index]
+    seen = np.where(points.bounce[members.index] == 0, seen, 0)
+    if not seen.any():
+        seen, reflects = np.ones(len(rank)), np.ones(len(rank))
+    views = []
+    for sensor in np.unique(seen[seen > 0]):
+        view = np.bincount(rank[seen == sensor], reflects[seen == sensor], n_patches)
+        brightness = view @ irradiance
+        if brightness > 0:
+            views.append(view / brightness)
+    return np.column_stack(views) if views else np.zeros((n_patches, 1))
 
 
-def _importance(rays, blocks, cache, members, seen) -> tuple[np.ndarray, np.ndarray]:
-    """By how much the picture changes with the direct and the indirect irradiance [K] of a patch.
+def _importance(rays, blocks, cache, members, views) -> tuple[np.ndarray, np.ndarray]:
+    """By how much each picture changes with a patch's direct and indirect irradiance [K, S].
 
-    The picture sends secondary rays of its own from what is ``seen`` [K] first; they end where the
-    gather rays from there do. From patch to patch, importance flows against the light.
+    A picture sends secondary rays of its own from what it sees first; they end where the gather
+    rays from there do. From patch to patch, importance flows against the light.
     """
     samples, n_patches = rays.samples, len(members.patches)
     some = np.s_[: min(samples, ADJOINT_RAYS)]
@@ -165,14 +174,16 @@ def _importance(rays, blocks, cache, members, seen) -> tuple[np.ndarray, np.ndar
     place = row.ravel(), np.broadcast_to(rank, row.shape).ravel()
     flow = csr_matrix((weight.ravel(), place), (2 * cache.patches.count, n_patches))
 
-    asked = flow @ seen
+    def of_patches(importance):
+        return importance.reshape(-1, 2, views.shape[1])[members.patches].transpose(1, 0, 2)
+
+    asked = flow @ views
     importance = asked
     for _ in range(MAX_BOUNCES):
-        total, of_indirect = importance.reshape(-1, 2)[members.patches].T
-        previous, importance = importance, asked + flow @ (total + of_indirect)
+        previous, importance = importance, asked + flow @ of_patches(importance).sum(axis=0)
         if np.abs(importance - previous).sum() <= CONVERGED * importance.sum():
             break
-    total, of_indirect = importance.reshape(-1, 2)[members.patches].T
+    total, of_indirect = of_patches(importance)
     return total, total + of_indirect
 
 

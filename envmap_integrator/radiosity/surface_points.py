@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..jit import upload, upload_vectors
+from ..jit import mean_channel, upload, upload_vectors
 from ..rendering.ray_counts import Ray, count
 from ..scene_order import ordered_shapes
 
@@ -41,6 +41,8 @@ class SurfacePoints:
     seen            [N]     1 + the sensor's index for a point on a walk from it, 0 on a global line
     turned          [N]     whether a bump or normal map turns the shading normal
     bounce          [N]     which hit of its walk or line it is, from 0
+    reflects        [N]     weight with which its walk has gone on, mean of the colour channels; 0
+                            on a line
     """
 
     position: np.ndarray
@@ -50,6 +52,7 @@ class SurfacePoints:
     seen: np.ndarray
     turned: np.ndarray
     bounce: np.ndarray
+    reflects: np.ndarray
 
     def __len__(self) -> int:
         return len(self.position)
@@ -301,7 +304,7 @@ def _hits_along(
     n_rays = dr.width(ray)
     size = n_hits * n_rays
     positions, normals, shading_normals = (dr.zeros(mi.Float, 3 * size) for _ in range(3))
-    object_of_point = dr.zeros(mi.UInt32, size)
+    object_of_point, reflects = dr.zeros(mi.UInt32, size), dr.zeros(mi.Float, size)
     kept, turned = dr.zeros(mi.Bool, size), dr.zeros(mi.Bool, size)
     n_hits_, n_rays_ = dr.opaque(mi.UInt32, n_hits), dr.opaque(mi.UInt32, n_rays)
 
@@ -310,7 +313,7 @@ def _hits_along(
     active = dr.full(mi.Bool, True, n_rays)
     while dr.hint(
         active,
-        exclude=[positions, normals, shading_normals, object_of_point, kept, turned],
+        exclude=[positions, normals, shading_normals, object_of_point, kept, turned, reflects],
         label="Scatter points",
     ):
         count(Ray.SURVEY, ray, active)
@@ -340,12 +343,13 @@ def _hits_along(
                 mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active
             )
             direction = si.to_world(bs.wo)
+            dr.scatter(reflects, mean_channel(weight), index, keep)
             active &= mi.luminance(weight) > 0 if len(weight) == 3 else weight[0] > 0
         ray = si.spawn_ray(direction)
         index += n_rays_
         active &= index < n_hits_ * n_rays_
 
-    dr.eval(positions, normals, shading_normals, object_of_point, kept, turned)
+    dr.eval(positions, normals, shading_normals, object_of_point, kept, turned, reflects)
     chosen = np.flatnonzero(kept.numpy())
     position, normal, shading_normal = (
         vectors.numpy().reshape(size, 3)[chosen]
@@ -359,4 +363,5 @@ def _hits_along(
         np.full(len(chosen), float(walk), dtype=np.float32),
         turned.numpy()[chosen],
         (chosen // n_rays).astype(np.uint32),
+        reflects.numpy()[chosen],
     )

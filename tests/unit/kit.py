@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
-from envmap_integrator.radiosity.irradiance import IrradianceCache, solve_irradiance
+from envmap_integrator.radiosity.irradiance import IrradianceCache, Solution, solve_irradiance
 from envmap_integrator.radiosity.patches import Patches, build_patches
 from envmap_integrator.radiosity.surface_points import ObjectIds, SurfacePoints, scatter_points
 from envmap_integrator.rendering.source_choice import Emitters, by_weight
@@ -65,10 +65,13 @@ class CoarseMesh:
         return patch.numpy(), size.numpy(), found.numpy()
 
     def solve(self, samples: int = 64) -> IrradianceCache:
+        return self.solution(samples).cache
+
+    def solution(self, samples: int) -> Solution:
         transport = Transport(self.patches, self.object_ids, by_weight(Emitters(self.scene)))
         return solve_irradiance(
             self.scene, transport, self.points, self.patch_of_point, self.cell_of_point, samples
-        ).cache
+        )
 
 
 def coarse_mesh(scene: mi.Scene, budget: int = 1024, points_per_patch: int = 128) -> CoarseMesh:
@@ -93,6 +96,7 @@ def surface_points(position: np.ndarray, normal, object_id=0, seen=1.0) -> Surfa
         np.broadcast_to(np.float32(seen), len(position)),
         np.zeros(len(position), bool),
         np.zeros(len(position), np.uint32),
+        np.ones(len(position), np.float32),
     )
 
 

@@ -117,6 +117,7 @@ def test_clusters_depend_neither_on_scale_nor_on_place(scale, shift):
         points.seen,
         points.turned,
         points.bounce,
+        points.reflects,
     )
     here, there = found(points)[0], found(moved)[0]
     assert len(here) == len(there)

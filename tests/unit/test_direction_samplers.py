@@ -124,7 +124,7 @@ def gathered(monkeypatch):
         seen.append((start.ray.d.numpy().T, start.pdf.numpy()))
         black = dr.zeros(mi.Spectrum, dr.width(start.ray))
         row = dr.zeros(mi.UInt32, dr.width(start.ray))
-        return transport.PathEnd(black, black, black, row, mi.Bool(False), mi.Float(dr.inf))
+        return transport.PathEnd(black, black, black, row, row, mi.Bool(False), mi.Float(dr.inf))
 
     monkeypatch.setattr(transport, "follow", follow)
     turned = mi.ScalarTransform4f().look_at([0, 0, 0], NORMAL.tolist(), [0, 0, 1])

@@ -100,9 +100,12 @@ def test_a_dim_furnace_beside_a_bright_one(albedo):
 
 
 def test_a_furnace_that_loses_nothing():
-    """It has no finite solution: the light of some bounces is what it gets."""
+    """It has no finite solution: the light of some bounces is what it gets.
+
+    A few more than are asked for: hits that no patch serves are traced on.
+    """
     light, inside = in_furnace(1.0)
-    assert_allclose(light.total[inside], np.pi * 0.5 * (MAX_BOUNCES + 2), rtol=0.01)
+    assert_allclose(light.total[inside], np.pi * 0.5 * (MAX_BOUNCES + 2), rtol=0.02)
 
 
 @pytest.mark.variants("llvm_ad_rgb", "llvm_ad_mono")

@@ -16,7 +16,7 @@ from envmap_integrator.radiosity.noise import TARGET, Noise
 from envmap_integrator.radiosity.patch_points import PatchPoints
 from envmap_integrator.rendering.source_choice import Emitters, by_weight
 from envmap_integrator.rendering.transport import Transport
-from tests.helpers import at, box, camera, emitting, grey, load, room
+from tests.helpers import Description, at, box, camera, emitting, grey, load, room
 from tests.unit.kit import coarse_mesh
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -24,24 +24,27 @@ pytestmark = pytest.mark.usefixtures("variant")
 BUDGET, SAMPLES = 512, 16
 
 
-def behind_a_wall() -> mi.Scene:
-    """A room whose lamp shines on the other side of a wall with a gap at one end."""
+def behind_a_wall(*sensors: Description) -> mi.Scene:
+    """A room whose lamp shines on the other side of a wall with a gap at one end.
+
+    The camera is behind the wall, unless there are other ``sensors``.
+    """
     place = at(0.1, 0.4, 0) @ mi.ScalarTransform4f().rotate([0, 1, 0], 90).scale([2.1, 2.1, 1])
     wall = {"type": "rectangle", "to_world": place, "bsdf": {"type": "twosided"} | grey(0.5)}
-    sensor = camera(origin=(1.5, -1.0, 0), target=(1, 1.5, -1))
+    sensors = sensors or (camera(origin=(1.5, -1.0, 0), target=(1, 1.5, -1)),)
     lamp = {"type": "sphere", "center": [-1.8, 1.0, 0], "radius": 0.1} | grey(0) | emitting(50)
     return load(
         {"type": "scene", "walls": box(2.0) | grey(0.5), "wall": wall, "lamp": lamp}
-        | {"sensor": sensor}
+        | {f"sensor{i}": sensor for i, sensor in enumerate(sensors)}
     )
 
 
-def solutions(scene: mi.Scene, more_rays: int = 0, count: int = 16):
+def solutions(scene: mi.Scene, more_rays: int = 0, count: int = 16, budget=BUDGET, samples=SAMPLES):
     """Brightness of what the sensor sees, and the stated error, of caches by other rays.
 
     What is seen gathers light by rays of its own, always the same, which end in the cache.
     """
-    coarse = coarse_mesh(scene, BUDGET, points_per_patch=32)
+    coarse = coarse_mesh(scene, budget, points_per_patch=32)
     transport = Transport(coarse.patches, coarse.object_ids, by_weight(Emitters(scene)))
     members = PatchPoints(coarse.points, coarse.patch_of_point, coarse.patches.count)
     patches = np.arange(len(members.patches))
@@ -59,14 +62,14 @@ def solutions(scene: mi.Scene, more_rays: int = 0, count: int = 16):
             coarse.points,
             coarse.patch_of_point,
             coarse.cell_of_point,
-            SAMPLES,
+            samples,
             more_rays,
             seed=1 << 20 | seed << 12,
         )
         arriving = rays.weight * solution.cache.irradiance(rays.row)
         arriving = block_mean(dr.mean(arriving), rays.samples).numpy()
         brightness.append(share @ (own + arriving))
-        stated.append(solution.relative_error)
+        stated.append(solution.noise.chance)
     return np.array(brightness), np.array(stated)
 
 
@@ -120,3 +123,29 @@ def test_every_patch_gets_new_rays():
     """Those that have asked for them don't count any longer."""
     silent = replace(noise(0.1), stake=np.array([1.0, 1.0, 1.0, 0.0]))
     assert silent.blocks_wanted(most=1000, samples=16)[3] == 1
+
+
+# ---------------------- Several views ----------------------
+
+
+def stated_by(*sensors: Description) -> float:
+    scene = behind_a_wall(*sensors)
+    coarse = coarse_mesh(scene, BUDGET, points_per_patch=32)
+    return coarse.solution(SAMPLES).noise.chance
+
+
+def test_a_bright_view_says_nothing_of_a_dim_one():
+    bright = camera(origin=(-1.0, -1.5, 0), target=(-1.8, 1.5, -1))
+    dim = camera(origin=(1.5, -1.0, 0), target=(1, 1.5, -1))
+    assert stated_by(bright) < stated_by(dim) / 2
+    assert stated_by(bright, dim) > stated_by(dim) / 2
+
+
+def test_what_reflects_nothing_says_nothing():
+    """The sunlit outside of one-sided walls, say, is as black as their inside may be bright."""
+    coarse = coarse_mesh(behind_a_wall(), BUDGET, points_per_patch=32)
+    stated = coarse.solution(SAMPLES).noise.chance
+    black = replace(coarse.points, reflects=np.zeros_like(coarse.points.reflects))
+    lit = replace(coarse.points, reflects=3 * coarse.points.reflects)
+    assert replace(coarse, points=black).solution(SAMPLES).noise.chance == 0
+    assert replace(coarse, points=lit).solution(SAMPLES).noise.chance == pytest.approx(stated)

@@ -1,0 +1,75 @@
+"""What the size of patches does to the picture: it's known, and smaller patches follow."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from envmap_integrator.radiosity.patches import build_patches
+from tests.helpers import load, room
+from tests.unit.kit import coarse_mesh, surface_points
+from tests.unit.test_noise import behind_a_wall, solutions
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def test_what_patches_cost_is_known():
+    """Patches across the end of a wall bring light behind it, whatever rays are sent."""
+    scene = behind_a_wall()
+    known = [coarse_mesh(scene, n, 32).solution(64).noise.coarseness for n in (512, 2048)]
+    right, _ = solutions(scene, count=4, budget=16384, samples=64)
+    for coarseness, budget in zip(known, (512, 2048), strict=True):
+        wrong, _ = solutions(scene, count=4, budget=budget, samples=64)
+        error = 1 - right.mean() / wrong.mean()
+        assert coarseness.bias - 3 * coarseness.doubt > 0.1
+        # To first order: of a large error, it is the lower bound.
+        assert error / 3 < coarseness.bias < 1.5 * error
+        assert coarseness.steep.any()
+    assert known[1].bias < known[0].bias
+
+
+def test_patches_are_small_enough_for_an_ordinary_room():
+    coarseness = coarse_mesh(load(room()), 4096, 24).solution(64).noise.coarseness
+    assert abs(coarseness.bias) < 0.003
+    assert abs(coarseness.steep_bias) < 0.002
+
+
+def test_steep_cells_are_divided_and_no_others():
+    coarse = coarse_mesh(load(room()), 1024, 64)
+    levels = coarse.patches.levels.numpy()
+    chosen = np.flatnonzero(levels)[::7]
+    divided = np.zeros(len(levels), dtype=int)
+    divided[chosen] = 1
+    finer, patch_of_point, cell_of_point = build_patches(
+        coarse.points, coarse.object_ids, 1024, divided
+    )
+    assert np.array_equal(cell_of_point, coarse.cell_of_point)
+    change = finer.levels.numpy().astype(int) - levels
+    assert np.array_equal(change, divided)
+    inside = divided[cell_of_point] == 1
+    assert len(np.unique(patch_of_point[inside])) > 2.5 * len(
+        np.unique(coarse.patch_of_point[inside])
+    )
+    assert len(np.unique(patch_of_point[~inside])) == len(np.unique(coarse.patch_of_point[~inside]))
+
+
+def test_parts_without_points_are_not_served():
+    """Beyond a thin wall, say, that no walk has passed: its light isn't known."""
+    random = np.random.default_rng(3)
+    position = np.column_stack([random.uniform(-1, 1, (4096, 2)), np.zeros(4096)])
+    known = position[:, 0] < 0.03
+    coarse = coarse_mesh(load(room()), 64, 8)
+    patches, *_ = build_patches(surface_points(position[known], [0, 0, 1]), coarse.object_ids, 64)
+
+    def served(x):
+        place = surface_points(np.array([[x, y, 0] for y in np.linspace(-0.9, 0.9, 64)]), [0, 0, 1])
+        p, normal, object_id = place.places()
+        _, size, found = patches.find_cell(p, normal, object_id)
+        u = random.uniform(size=(2, 64)).astype(np.float32)
+        return patches.find(p, normal, object_id, size, found, type(p.xy)(u))[1].numpy(), size
+
+    found, size = served(-0.05)
+    assert found.all()
+    half = size.numpy().max() / 2
+    assert not served(0.03 + half)[0].any()
+    assert not served(0.03 + 2.1 * half)[0].any()
