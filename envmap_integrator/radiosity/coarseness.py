@@ -42,8 +42,8 @@ class Coarseness:
 
     @property
     def squared_error(self) -> float:
-        """Square of the relative error, less what the doubt adds to it on average."""
-        return max(self.bias**2 - self.doubt**2, 0.0)
+        """Square of the relative error, as far as it's beyond doubt."""
+        return max(abs(self.bias) - self.doubt, 0.0) ** 2
 
 
 def coarseness(

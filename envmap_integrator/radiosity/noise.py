@@ -102,24 +102,34 @@ def cache_noise(
     arriving = of_patches.numpy()
     coarse = coarseness(rays, blocks, table, arriving, importance, members, cell_of_point, n_cells)
 
-    # ---- Scatter of each block: rays k and k ^ step start in neighbouring directions ----
+    # ---- Scatter within each block: rays k and k ^ step start in neighbouring directions ----
     step = 1 << (samples.bit_length() - 1) // 2
     sources, others = rays.of_sources, rays.of_others + of_patches
+    t, i = total[rank], indirect[rank]
+    block = sum(
+        importance * _block_sum(x, samples)[:, None] / samples
+        for importance, x in ((t, sources), (i, others))
+    )
     if samples > 1:
         lane = dr.arange(mi.UInt32, dr.width(others)) ^ dr.opaque(mi.UInt32, step)
         dr.eval(others)
         sources, others = (x - dr.gather(mi.Float, x, lane) for x in (sources, others))
     products = sources * sources, others * others, 2 * sources * others
     moments = (0.5 / samples**2 * _block_sum(x, samples)[:, None] for x in products)
-    t, i = total[rank], indirect[rank]
-    variance = sum(a * moment for a, moment in zip((t * t, i * i, t * i), moments, strict=True))
+    within = sum(a * moment for a, moment in zip((t * t, i * i, t * i), moments, strict=True))
 
-    # ---- By patch, and in its surroundings ----
-    share = 1 / blocks.count[rank]
-    by_patch = csr_matrix((share**2, (rank, np.arange(len(rank)))), (len(blocks.count), len(rank)))
-    variance = by_patch @ variance
+    # ---- By patch: the scatter of its blocks, if there are several, as rays of one are stratified
+    count = blocks.count
+    share = 1 / count[rank]
+    by_patch = csr_matrix((share, (rank, np.arange(len(rank)))), (len(count), len(rank)))
+    between = np.square(block - (by_patch @ block)[rank])
+    several = count > 1
+    variance = by_patch @ np.where(several[rank, None], between, within)
+    variance /= np.where(several, count - 1, 1)[:, None]
     chance = np.sqrt(variance.sum(axis=0).max())
     variance = variance.sum(axis=1)
+
+    # ---- In its surroundings ----
     cell = np.unique(cell_of_point[members.index[members.first[:-1]]], return_inverse=True)[1]
 
     def around(values):
@@ -130,9 +140,9 @@ def cache_noise(
     return Noise(
         chance=float(chance),
         coarseness=coarse,
-        scatter=np.sqrt(around(variance * blocks.count * samples)),
+        scatter=np.sqrt(around(variance * count * samples)),
         stake=around(indirect.sum(axis=1) * irradiance),
-        count=blocks.count,
+        count=count,
         escaped_share=escaped / np.maximum(escaped + patched, 1e-30),
     )
 

@@ -16,16 +16,15 @@ pytestmark = pytest.mark.usefixtures("variant")
 def test_what_patches_cost_is_known():
     """Patches across the end of a wall bring light behind it, whatever rays are sent."""
     scene = behind_a_wall()
-    known = [coarse_mesh(scene, n, 32).solution(64).noise.coarseness for n in (512, 2048)]
     right, _ = solutions(scene, count=4, budget=16384, samples=64)
-    for coarseness, budget in zip(known, (512, 2048), strict=True):
-        wrong, _ = solutions(scene, count=4, budget=budget, samples=64)
-        error = 1 - right.mean() / wrong.mean()
-        assert coarseness.bias - 3 * coarseness.doubt > 0.1
-        # To first order: of a large error, it is the lower bound.
-        assert error / 3 < coarseness.bias < 1.5 * error
-        assert coarseness.steep.any()
-    assert known[1].bias < known[0].bias
+    wrong, _ = solutions(scene, count=4, budget=2048, samples=64)
+    error = 1 - right.mean() / wrong.mean()
+    known = coarse_mesh(scene, 2048, 32).solution(64).noise.coarseness
+    assert known.bias - 3 * known.doubt > 0.1
+    # To first order: of a large error, it is the lower bound.
+    assert error / 3 < known.bias < 1.5 * error
+    assert known.steep.any()
+    assert coarse_mesh(scene, 8192, 32).solution(64).noise.coarseness.bias < known.bias / 1.5
 
 
 def test_patches_are_small_enough_for_an_ordinary_room():
