@@ -30,10 +30,9 @@ PARTS = 8
 BUCKET = 4
 #: Bits of an entry that don't belong to the fingerprint: of the large cells' table, which hold the
 #: level, and of the patches'.
-_LEVEL_BITS, _MARK_BITS = 4, 2 + PARTS
-#: Marks of a patch: direct light is uneven over it, it has been left out, and the first of those of
-#: the parts of it that have surface points.
-_UNEVEN, _DROPPED, _KNOWN = 1, 2, 4
+_LEVEL_BITS, _MARK_BITS = 4, 2
+#: Marks of a patch: direct light is uneven over it, and it has been left out.
+_UNEVEN, _DROPPED = 1, 2
 
 
 @dataclass(frozen=True)
@@ -77,22 +76,20 @@ class Patches:
     def find(self, p, normal, object_id, size, active=True, u=None):
         """Look up the patch of an oriented surface point in a cell with patches of edge ``size``.
 
-        Returns ``(patch, found, even, own)``. Surfaces too small to have been hit have no patch,
-        nor do parts of a patch that no surface point lies in, such as those beyond a thin wall;
+        Returns ``(patch, found, even, own)``. Surfaces too small to have been hit have no patch;
         where direct light isn't ``even``, the patch's irradiance stands for indirect light alone.
         ``own`` is the patch that the point itself lies in, meaningless if there is none.
 
         With ``u``, uniform in the unit square, the point is moved at random by up to half a patch
         along the surface: the expectation interpolates between patches, so their borders don't
         show. Where the moved point belongs to no patch (beyond an edge of the surface), the patch
-        of the point itself is taken; where that one isn't known or has been left out, there is
-        none.
+        of the point itself is taken; where that one has been left out, there is none.
         """
         level = mi.UInt32(dr.log2(self.size / size) + 0.5)
         identity = self._identity(normal, object_id)
         marks, exists, own = self._probe(self.cells, p, identity, level, _MARK_BITS, active)
-        known = (marks >> (self.part(p, size) + 2)) & 1
-        found = exists & (known != 0) & ((marks & _DROPPED) == 0)
+        dropped = exists & ((marks & _DROPPED) != 0)
+        found = exists & ~dropped
         if u is None:
             return own, found, (marks & _UNEVEN) == 0, own
 
@@ -102,11 +99,13 @@ class Patches:
         v = mi.Point2f(256 * u.x - dr.floor(256 * u.x), 256 * u.y - dr.floor(256 * u.y))
         tilted = normal + 0.4 * (frame.s * (v.x - 0.5) + frame.t * (v.y - 0.5))
         around = self._identity(tilted, object_id)
-        # What isn't known or has been left out isn't served by its neighbours: it's unlike them.
-        entry, hit, patch = self._probe(self.cells, moved, around, level, _MARK_BITS, found)
+        # What has been left out isn't served by its neighbours: it's unlike them.
+        entry, hit, patch = self._probe(
+            self.cells, moved, around, level, _MARK_BITS, active & ~dropped
+        )
         hit &= (entry & _DROPPED) == 0
         even = ((marks | dr.select(hit, entry, 0)) & _UNEVEN) == 0
-        return dr.select(hit, patch, own), found, even, own
+        return dr.select(hit, patch, own), found | hit, even, own
 
     def part(self, p, size) -> mi.UInt32:
         """Which of its parts a point lies in, in a patch of edge ``size``."""
@@ -216,12 +215,6 @@ def build_patches(
     cells, cell_of_point = np.unique(key, return_inverse=True)
     cells, patch_of_cell = _hash_table(cells & ~np.uint64((1 << _MARK_BITS) - 1))
     patch_of_point = patch_of_cell[cell_of_point]
-    edge = patches.size / mi.Float(mi.UInt32(1) << level_of_point)
-    part = patches.part(position, edge).numpy()
-    standing = patch_of_point >= 0
-    known = np.zeros(PARTS * len(cells), dtype=bool)
-    known[(PARTS * patch_of_point + part)[standing]] = True
-    cells |= _KNOWN * np.packbits(known, bitorder="little").astype(np.uint32)
     patches = replace(patches, levels=upload(mi.UInt32, levels), cells=upload(mi.UInt32, cells))
     return patches, patch_of_point, large_of_point
 

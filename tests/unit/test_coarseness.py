@@ -7,7 +7,7 @@ import pytest
 
 from envmap_integrator.radiosity.patches import build_patches
 from tests.helpers import load, room
-from tests.unit.kit import coarse_mesh, surface_points
+from tests.unit.kit import coarse_mesh
 from tests.unit.test_noise import behind_a_wall, solutions
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -50,25 +50,3 @@ def test_steep_cells_are_divided_and_no_others():
         np.unique(coarse.patch_of_point[inside])
     )
     assert len(np.unique(patch_of_point[~inside])) == len(np.unique(coarse.patch_of_point[~inside]))
-
-
-def test_parts_without_points_are_not_served():
-    """Beyond a thin wall, say, that no walk has passed: its light isn't known."""
-    random = np.random.default_rng(3)
-    position = np.column_stack([random.uniform(-1, 1, (4096, 2)), np.zeros(4096)])
-    known = position[:, 0] < 0.03
-    coarse = coarse_mesh(load(room()), 64, 8)
-    patches, *_ = build_patches(surface_points(position[known], [0, 0, 1]), coarse.object_ids, 64)
-
-    def served(x):
-        place = surface_points(np.array([[x, y, 0] for y in np.linspace(-0.9, 0.9, 64)]), [0, 0, 1])
-        p, normal, object_id = place.places()
-        _, size, found = patches.find_cell(p, normal, object_id)
-        u = random.uniform(size=(2, 64)).astype(np.float32)
-        return patches.find(p, normal, object_id, size, found, type(p.xy)(u))[1].numpy(), size
-
-    found, size = served(-0.05)
-    assert found.all()
-    half = size.numpy().max() / 2
-    assert not served(0.03 + half)[0].any()
-    assert not served(0.03 + 2.1 * half)[0].any()
