@@ -102,8 +102,8 @@ class Prepared:
     source_rows        [C]          ... and which row is each large cell's
     views              names (``view_name``) of the sensors that it was made for,
     service            ... and what the coarse mesh does for them
-    relative_error     [1]          standard error of the brightness of their pictures that comes
-                                    from the noise of the cache
+    relative_error     [1]          error of the brightness of their pictures, of the worst, that
+                                    comes from the noise of the cache and the size of the patches
     maps               one cube map per cluster
     cluster_of_cell    cluster index of each large cell, ``len(maps)`` where there is none
     stage_times        seconds spent in each stage

@@ -62,7 +62,7 @@ def coarseness(
     patch that it ends in, both the mean of the colour channels, and ``importance`` [K] how much the
     picture changes with the indirect irradiance of a patch.
     """
-    n_patches = len(table) // 2
+    n_patches = len(table) // 2 + 1  # The last stands for none.
     start, place, row = (x.numpy().astype(np.int64) for x in (rays.start, rays.place, rays.row))
     weight = mean_channel(rays.weight).numpy().astype(np.float64)
     read = table[row]

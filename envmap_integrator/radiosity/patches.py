@@ -78,7 +78,7 @@ class Patches:
 
         Returns ``(patch, found, even, own)``. Surfaces too small to have been hit have no patch;
         where direct light isn't ``even``, the patch's irradiance stands for indirect light alone.
-        ``own`` is the patch that the point itself lies in, meaningless if there is none.
+        ``own`` is the patch that the point itself lies in, P if there is none.
 
         With ``u``, uniform in the unit square, the point is moved at random by up to half a patch
         along the surface: the expectation interpolates between patches, so their borders don't
@@ -90,8 +90,9 @@ class Patches:
         marks, exists, own = self._probe(self.cells, p, identity, level, _MARK_BITS, active)
         dropped = exists & ((marks & _DROPPED) != 0)
         found = exists & ~dropped
+        own_or_none = dr.select(exists, own, dr.opaque(mi.UInt32, self.count))
         if u is None:
-            return own, found, (marks & _UNEVEN) == 0, own
+            return own, found, (marks & _UNEVEN) == 0, own_or_none
 
         frame = mi.Frame3f(normal)
         moved = p + size * (frame.s * (u.x - 0.5) + frame.t * (u.y - 0.5))
@@ -105,7 +106,7 @@ class Patches:
         )
         hit &= (entry & _DROPPED) == 0
         even = ((marks | dr.select(hit, entry, 0)) & _UNEVEN) == 0
-        return dr.select(hit, patch, own), found | hit, even, own
+        return dr.select(hit, patch, own), found | hit, even, own_or_none
 
     def part(self, p, size) -> mi.UInt32:
         """Which of its parts a point lies in, in a patch of edge ``size``."""
@@ -214,9 +215,8 @@ def build_patches(
     key = cell_keys(patches, position, identity, level_of_point)
     cells, cell_of_point = np.unique(key, return_inverse=True)
     cells, patch_of_cell = _hash_table(cells & ~np.uint64((1 << _MARK_BITS) - 1))
-    patch_of_point = patch_of_cell[cell_of_point]
     patches = replace(patches, levels=upload(mi.UInt32, levels), cells=upload(mi.UInt32, cells))
-    return patches, patch_of_point, large_of_point
+    return patches, patch_of_cell[cell_of_point], large_of_point
 
 
 def _filled(position, cell_of_point, n_points, size) -> np.ndarray:
