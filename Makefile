@@ -38,7 +38,7 @@ $(STAMP): pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[test,compare]'
 	@touch $@
 
-CHECK_LLVM := $(BIN)/python -c 'from envmap_integrator.llvm import ensure_llvm; print(ensure_llvm())'
+CHECK_LLVM := $(BIN)/python -c 'from envmap_integrator.system.llvm import ensure_llvm; print(ensure_llvm())'
 
 define INSTALL_LLVM
 command -v apt-get >/dev/null && $(SUDO) true 2>/dev/null && $(SUDO) apt-get update -qq && \

@@ -12,8 +12,8 @@ import numpy as np
 from compare.metrics import Picture, Thirds, rel_mse_of_difference
 from compare.runs import render
 from compare.scenes import PATH, View
-from envmap_integrator.progress import stage
-from envmap_integrator.storage import StorageError, read, write
+from envmap_integrator.system.progress import stage
+from envmap_integrator.system.storage import StorageError, read, write
 
 PART_SPP = 64
 """References are rendered in parts, so that memory is bounded and their spread is known."""

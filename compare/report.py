@@ -20,8 +20,8 @@ from rich.table import Table as RichTable
 import envmap_integrator
 from compare.figures import exposure, png, srgb
 from compare.metrics import Picture
-from envmap_integrator.atomic import replacing
 from envmap_integrator.cli.output import write_bitmap
+from envmap_integrator.system.atomic import replacing
 
 SCHEMA = 1
 """Version of the JSON files' layout."""

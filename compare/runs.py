@@ -17,8 +17,8 @@ import numpy as np
 from compare.metrics import Picture
 from compare.scenes import PATH, Subject
 from envmap_integrator.cli.timing import compilation_time, measure, record_kernels
-from envmap_integrator.denoiser import denoise, prepare_for_denoiser, warm_up
-from envmap_integrator.progress import stage
+from envmap_integrator.imaging.denoiser import denoise, prepare_for_denoiser, warm_up
+from envmap_integrator.system.progress import stage
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,10 @@ import drjit as dr
 import mitsuba as mi
 
 from compare.scenes import HYBRID, Subject
-from envmap_integrator.maps.far_field import FarField
-from envmap_integrator.radiosity.patches import Patches
-from envmap_integrator.rendering import camera, transport
+from envmap_integrator.lookup.far_field import FarField
+from envmap_integrator.lookup.patches import Patches
+from envmap_integrator.transport import camera
+from envmap_integrator.transport import path as transport
 
 FINEST = -32.0
 """``mip_bias`` with which every look-up reads the finest level."""

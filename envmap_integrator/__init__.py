@@ -8,7 +8,7 @@ After Reinhard, Tijssen and Jansen: Environment Mapping for Efficient Sampling o
 Interreflection (1994).
 """
 
-from .llvm import prefer_good_library
+from .system.llvm import prefer_good_library
 
 prefer_good_library()  # Before mitsuba is imported: Dr.Jit loads libLLVM at once.
 

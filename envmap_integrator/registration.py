@@ -9,7 +9,7 @@ import mitsuba as mi
 
 #: Plugin modules in the order of their imports of each other; common bases first.
 _MODULES = (
-    "integrators.common",
+    "integrators.base",
     "integrators.one_level_path",
     "integrators.source_selection",
     "integrators.envmap_bake",

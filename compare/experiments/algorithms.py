@@ -21,7 +21,7 @@ from compare.references import Reference, reference
 from compare.report import Illustration, Report, Slider, Table
 from compare.runs import Measurements, Task, equal_time_spp, interleave, render
 from compare.scenes import PAPER_CLUSTER, PAPER_ROOM, PATH, Subject, View
-from envmap_integrator.rendering.ray_counts import count_rays
+from envmap_integrator.system.ray_counts import count_rays
 
 RADIOSITY = ("coarse mesh", "direct light", "irradiance cache")
 MAPS = ("clusters", "maps")

@@ -38,8 +38,8 @@ from compare.variants import (
     Variant,
     variants,
 )
-from envmap_integrator.progress import stage
-from envmap_integrator.rendering.ray_counts import count_rays
+from envmap_integrator.system.progress import stage
+from envmap_integrator.system.ray_counts import count_rays
 
 SCENES = (PAPER_ROOM,)
 

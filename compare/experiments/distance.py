@@ -44,7 +44,7 @@ from compare.paper_room import Options as MirrorOptions
 from compare.references import Reference, reference
 from compare.regions import Mask, pixel_centres
 from compare.report import Illustration, Report
-from envmap_integrator.maps.cube import exit_distance
+from envmap_integrator.lookup.cube import exit_distance
 
 PAPER = {
     "maps": {1.25: 1888, 5: 1380, 10: 1079, 14: 1002},

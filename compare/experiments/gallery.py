@@ -22,7 +22,7 @@ from compare.hard_cases import CASES
 from compare.metrics import Picture
 from compare.options import option
 from compare.report import Illustration, Report, Table
-from envmap_integrator.progress import stage
+from envmap_integrator.system.progress import stage
 
 TILE = 72, 54
 """Width and height of a picture on the sheet [dots]."""

@@ -16,7 +16,7 @@ from envmap_integrator.cli import commands
 from envmap_integrator.cli.doctor import doctor
 from envmap_integrator.cli.errors import condense
 from envmap_integrator.cli.scene_file import parse_assignment, parse_setting
-from envmap_integrator.interrupt import interruptible
+from envmap_integrator.system.interrupt import interruptible
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130

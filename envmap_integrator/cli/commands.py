@@ -13,12 +13,12 @@ from rich.console import Console
 from rich.table import Table
 
 import envmap_integrator
-from envmap_integrator.atomic import check_writable
 from envmap_integrator.cli.output import write_bitmap, write_png
 from envmap_integrator.cli.scene_file import SceneFile
 from envmap_integrator.cli.timing import compilation_time, measure, record_kernels
-from envmap_integrator.denoiser import denoise, prepare_for_denoiser, warm_up
-from envmap_integrator.llvm import ensure_llvm
+from envmap_integrator.imaging.denoiser import denoise, prepare_for_denoiser, warm_up
+from envmap_integrator.system.atomic import check_writable
+from envmap_integrator.system.llvm import ensure_llvm
 
 
 def render(args: argparse.Namespace) -> int:

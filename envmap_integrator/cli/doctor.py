@@ -14,8 +14,8 @@ import mitsuba as mi
 from rich.console import Console
 
 import envmap_integrator
-from envmap_integrator.checks import SUPPORTED_VARIANTS
-from envmap_integrator.llvm import LLVMError, LLVMLibrary, ensure_llvm
+from envmap_integrator.system.checks import SUPPORTED_VARIANTS
+from envmap_integrator.system.llvm import LLVMError, LLVMLibrary, ensure_llvm
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from envmap_integrator.atomic import replacing
+from envmap_integrator.system.atomic import replacing
 
 
 def write_bitmap(path: Path, bitmap: mi.Bitmap) -> None:

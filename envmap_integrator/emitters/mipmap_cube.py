@@ -5,13 +5,13 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..checks import check_variant, misplaced
-from ..jit import upload
-from ..maps.clusters import ClusterRequest
-from ..maps.cube import direction_to_face, face_to_direction, solid_angles, texel
-from ..maps.cube_map import from_stored
-from ..parameters import Parameters
-from ..storage import StorageError, read
+from ..lookup.cube import direction_to_face, face_to_direction, solid_angles, texel
+from ..lookup.cube_map import from_stored
+from ..preparation.maps.clusters import ClusterRequest
+from ..system.checks import check_variant, misplaced
+from ..system.jit import upload
+from ..system.parameters import Parameters
+from ..system.storage import StorageError, read
 
 
 class MipmapCube(mi.Emitter):

@@ -5,10 +5,10 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..maps.bake import bake_maps
-from ..maps.cube_map import CubeMap
-from ..parameters import Parameters
-from .common import CachedIntegrator
+from ..lookup.cube_map import CubeMap
+from ..preparation.maps.bake import bake_maps
+from ..system.parameters import Parameters
+from .base import CachedIntegrator
 
 
 class EnvmapBake(CachedIntegrator):

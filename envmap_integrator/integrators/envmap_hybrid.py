@@ -5,10 +5,10 @@ from __future__ import annotations
 import mitsuba as mi
 
 from ..emitters.mipmap_cube import MipmapCube
-from ..maps.cube_map import MAX_RESOLUTION
-from ..maps.far_field import FarField, far_field
-from ..parameters import Parameters
-from .common import GatheringIntegrator
+from ..lookup.cube_map import MAX_RESOLUTION
+from ..lookup.far_field import FarField, far_field
+from ..system.parameters import Parameters
+from .base import GatheringIntegrator
 from .envmap_bake import EnvmapBake
 
 

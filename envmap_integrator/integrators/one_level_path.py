@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .common import GatheringIntegrator
+from .base import GatheringIntegrator
 
 
 class OneLevelPath(GatheringIntegrator):

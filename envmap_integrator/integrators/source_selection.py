@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .common import CachedIntegrator
+from .base import CachedIntegrator
 
 
 class SourceSelection(CachedIntegrator):

@@ -32,7 +32,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from envmap_integrator import storage
+from envmap_integrator.system import storage
 from tests.helpers import ROOT, cluster, integrator, load, room
 
 #: Limits of the time [s] to read one file, and to render with it.

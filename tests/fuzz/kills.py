@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from envmap_integrator.atomic import PREFIX
-from envmap_integrator.storage import read, write
+from envmap_integrator.system.atomic import PREFIX
+from envmap_integrator.system.storage import read, write
 
 #: Versions that a writer leaves in turn, of different sizes.
 VERSIONS = 4

@@ -11,8 +11,8 @@ import pytest
 from scipy.ndimage import convolve, median_filter
 
 from compare.metrics import error_floor, rel_mse
-from envmap_integrator.denoiser import denoise
-from envmap_integrator.rendering import film as film_module
+from envmap_integrator.imaging import film as film_module
+from envmap_integrator.imaging.denoiser import denoise
 from tests.helpers import (
     SCENES,
     at,

@@ -11,8 +11,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envmap_integrator.pipeline import Settings
-from envmap_integrator.radiosity import gather
+from envmap_integrator.preparation.baked_state import Settings
+from envmap_integrator.preparation.radiosity import gather
 from tests.helpers import ROOT, camera, cluster, integrator, load, picture, room
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envmap_integrator.rendering.ray_counts import Ray, count_rays
+from envmap_integrator.system.ray_counts import Ray, count_rays
 from tests.helpers import ball, camera, cluster, grey, integrator, load, picture, room
 
 pytestmark = pytest.mark.usefixtures("variant")

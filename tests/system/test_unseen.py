@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envmap_integrator import pipeline
+from envmap_integrator.preparation import pipeline
 from tests.helpers import (
     Description,
     Estimate,

@@ -7,11 +7,15 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
-from envmap_integrator.radiosity.irradiance import IrradianceCache, Solution, solve_irradiance
-from envmap_integrator.radiosity.patches import Patches, build_patches
-from envmap_integrator.radiosity.surface_points import ObjectIds, SurfacePoints, scatter_points
-from envmap_integrator.rendering.source_choice import Emitters, by_weight
-from envmap_integrator.rendering.transport import Transport
+from envmap_integrator.lookup.emitter_choice import Emitters
+from envmap_integrator.lookup.ids import ObjectIds
+from envmap_integrator.lookup.irradiance_cache import IrradianceCache
+from envmap_integrator.lookup.patches import Patches
+from envmap_integrator.preparation.coarse_mesh.build import build_patches
+from envmap_integrator.preparation.coarse_mesh.surface_points import SurfacePoints, scatter_points
+from envmap_integrator.preparation.radiosity.alias_tables import by_weight
+from envmap_integrator.preparation.radiosity.irradiance import Solution, solve_irradiance
+from envmap_integrator.transport.path import Transport
 from tests.helpers import Estimate
 
 WALL = [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]]

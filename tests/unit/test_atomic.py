@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from envmap_integrator.atomic import PREFIX, StorageError, replacing
+from envmap_integrator.system.atomic import PREFIX, StorageError, replacing
 from tests.helpers import unprivileged
 
 

@@ -6,8 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import pytest
 
-from envmap_integrator.rendering.camera import CameraSample
-from envmap_integrator.rendering.irradiance_filter import Gathered
+from envmap_integrator.transport.camera import CameraSample
+from envmap_integrator.transport.gathered import Gathered
 
 pytestmark = pytest.mark.usefixtures("variant")
 

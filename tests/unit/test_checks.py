@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import pytest
 
-from envmap_integrator.checks import SUPPORTED_VARIANTS, check_scene, check_variant
+from envmap_integrator.system.checks import SUPPORTED_VARIANTS, check_scene, check_variant
 from tests.helpers import ball, camera, load, room
 
 pytestmark = pytest.mark.usefixtures("variant")

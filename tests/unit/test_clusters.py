@@ -6,13 +6,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envmap_integrator.maps.clusters import (
+from envmap_integrator.preparation.coarse_mesh.surface_points import SurfacePoints
+from envmap_integrator.preparation.maps.clusters import (
     ClusterRequest,
     cluster_of_cell,
     find_clusters,
     listed_clusters,
 )
-from envmap_integrator.radiosity.surface_points import SurfacePoints
 from tests.helpers import ball
 from tests.unit.kit import scene_of, surface_points
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from envmap_integrator.radiosity.patches import build_patches
+from envmap_integrator.preparation.coarse_mesh.build import build_patches
 from tests.helpers import load, room
 from tests.unit.kit import coarse_mesh
 from tests.unit.test_noise import behind_a_wall, solutions

@@ -7,9 +7,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envmap_integrator.radiosity.irradiance import IrradianceCache
-from envmap_integrator.rendering.source_choice import Emitters, by_weight
-from envmap_integrator.rendering.transport import PathState, Transport, follow
+from envmap_integrator.lookup.emitter_choice import Emitters
+from envmap_integrator.lookup.irradiance_cache import IrradianceCache
+from envmap_integrator.preparation.radiosity.alias_tables import by_weight
+from envmap_integrator.transport.path import PathState, Transport, follow
 from tests.helpers import box, grey
 from tests.unit.kit import coarse_mesh, scene_of, surface_points
 

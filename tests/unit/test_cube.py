@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from envmap_integrator.maps import cube
+from envmap_integrator.lookup import cube
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -13,14 +13,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from envmap_integrator.jit import SpareNumbers
-from envmap_integrator.maps.bake import bake_maps
-from envmap_integrator.maps.clusters import Cluster
-from envmap_integrator.maps.cube import direction_to_face
-from envmap_integrator.radiosity import gather, irradiance
-from envmap_integrator.radiosity.surface_points import _global_lines
-from envmap_integrator.rendering import transport
-from envmap_integrator.rendering.source_choice import Emitters, by_weight
+from envmap_integrator.lookup.cube import direction_to_face
+from envmap_integrator.lookup.cube_map import Cluster
+from envmap_integrator.lookup.emitter_choice import Emitters
+from envmap_integrator.preparation.coarse_mesh.surface_points import _global_lines
+from envmap_integrator.preparation.maps.bake import bake_maps
+from envmap_integrator.preparation.radiosity import gather, irradiance
+from envmap_integrator.preparation.radiosity.alias_tables import by_weight
+from envmap_integrator.system.jit import SpareNumbers
+from envmap_integrator.transport import path as transport
 from tests.helpers import ball, grey
 from tests.unit.kit import coarse_mesh, scene_of, surface_points
 

@@ -6,8 +6,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envmap_integrator.radiosity.direct_light import SAMPLES
-from envmap_integrator.radiosity.evenness import contrasts
+from envmap_integrator.preparation.radiosity.direct_light import SAMPLES
+from envmap_integrator.preparation.radiosity.evenness import contrasts
 
 pytestmark = pytest.mark.usefixtures("variant")
 

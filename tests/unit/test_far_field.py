@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from envmap_integrator.maps.clusters import Cluster
-from envmap_integrator.maps.cube import face_to_direction, n_levels
-from envmap_integrator.maps.cube_map import CubeMap
-from envmap_integrator.maps.far_field import HAND_OFF, FarField, far_field
-from envmap_integrator.maps.mipmap import build_levels
+from envmap_integrator.lookup.cube import face_to_direction, n_levels
+from envmap_integrator.lookup.cube_map import Cluster, CubeMap
+from envmap_integrator.lookup.far_field import HAND_OFF, FarField, far_field
+from envmap_integrator.preparation.maps.mipmap import build_levels
 from tests.helpers import at, block, grey, lamp, load, scaled
 from tests.unit.kit import scene_of
 

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envmap_integrator.fingerprint import PARTS, SceneFingerprint, difference
+from envmap_integrator.system.fingerprint import PARTS, SceneFingerprint, difference
 from tests.helpers import ROOT, at, ball, camera, lamp, load, open_scene, room, scaled
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -277,7 +277,7 @@ def test_nothing_is_read_twice(monkeypatch):
     scene = load(textured_room())
     read = SceneFingerprint()
     before = read(scene)
-    monkeypatch.setattr("envmap_integrator.fingerprint.hashlib", None)
+    monkeypatch.setattr("envmap_integrator.system.fingerprint.hashlib", None)
     assert read(scene) == before
 
 

@@ -11,8 +11,8 @@ import drjit as dr
 import mitsuba as mi
 import pytest
 
-from envmap_integrator import interrupt
-from envmap_integrator.interrupt import going_on, interruptible
+from envmap_integrator.system import interrupt
+from envmap_integrator.system.interrupt import going_on, interruptible
 
 pytestmark = pytest.mark.usefixtures("variant")
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from envmap_integrator.radiosity.irradiance import MAX_BOUNCES, TOLERANCE
-from envmap_integrator.radiosity.patch_points import PatchPoints
+from envmap_integrator.preparation.coarse_mesh.patch_points import PatchPoints
+from envmap_integrator.preparation.radiosity.irradiance import MAX_BOUNCES, TOLERANCE
 from tests.helpers import QUANTILE, assert_agree, at, ball, box, emitting, exactly, grey
 from tests.unit.kit import WALL, CoarseMesh, coarse_mesh, mean_of, mesh, scene_of
 

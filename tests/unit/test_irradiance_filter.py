@@ -7,14 +7,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envmap_integrator.jit import upload
-from envmap_integrator.rendering.irradiance_filter import (
+from envmap_integrator.imaging.irradiance_filter import (
     RADIUS,
-    Gathered,
     filter_irradiance,
     pixel_records,
     tolerance,
 )
+from envmap_integrator.system.jit import upload
+from envmap_integrator.transport.gathered import Gathered
 
 pytestmark = [
     pytest.mark.usefixtures("variant"),

@@ -9,7 +9,7 @@ from pathlib import Path
 import drjit as dr
 import pytest
 
-from envmap_integrator import llvm
+from envmap_integrator.system import llvm
 
 OLD_VERSIONS = (14, 15, 16)
 
@@ -117,7 +117,7 @@ def test_an_old_library_gives_an_error_and_no_abort(version):
     old = [library for library in llvm.installed_libraries() if library.version[0] == version]
     if not old:
         pytest.skip(f"LLVM {version} is not installed")
-    program = "from envmap_integrator.llvm import ensure_llvm; ensure_llvm()"
+    program = "from envmap_integrator.system.llvm import ensure_llvm; ensure_llvm()"
     environment = os.environ | {llvm.ENV_VARIABLE: str(old[0].path)}
     process = subprocess.run(
         [sys.executable, "-c", program], env=environment, capture_output=True, text=True

@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from envmap_integrator import memory
-from envmap_integrator.memory import check_memory, free_memory
+from envmap_integrator.system import memory
+from envmap_integrator.system.memory import check_memory, free_memory
 
 GB = 10**9
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from envmap_integrator.maps.cube import solid_angles
-from envmap_integrator.maps.mipmap import build_levels
+from envmap_integrator.lookup.cube import solid_angles
+from envmap_integrator.preparation.maps.mipmap import build_levels
 
 RESOLUTION = 16
 GARBAGE = 1e9

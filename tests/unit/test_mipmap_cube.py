@@ -8,16 +8,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from envmap_integrator.maps.clusters import Cluster
-from envmap_integrator.maps.cube import (
+from envmap_integrator.lookup.cube import (
     direction_to_face,
     face_to_direction,
     n_levels,
     solid_angles,
 )
-from envmap_integrator.maps.cube_map import CubeMap, from_stored, to_parts
-from envmap_integrator.maps.mipmap import build_levels
-from envmap_integrator.storage import read, write
+from envmap_integrator.lookup.cube_map import Cluster, CubeMap, from_stored, to_parts
+from envmap_integrator.preparation.maps.mipmap import build_levels
+from envmap_integrator.system.storage import read, write
 from tests.helpers import (
     assert_agree,
     camera,

@@ -9,13 +9,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envmap_integrator.radiosity.coarseness import Coarseness
-from envmap_integrator.radiosity.gather import block_mean, gather
-from envmap_integrator.radiosity.irradiance import solve_irradiance
-from envmap_integrator.radiosity.noise import TARGET, Noise
-from envmap_integrator.radiosity.patch_points import PatchPoints
-from envmap_integrator.rendering.source_choice import Emitters, by_weight
-from envmap_integrator.rendering.transport import Transport
+from envmap_integrator.lookup.emitter_choice import Emitters
+from envmap_integrator.preparation.coarse_mesh.patch_points import PatchPoints
+from envmap_integrator.preparation.radiosity.alias_tables import by_weight
+from envmap_integrator.preparation.radiosity.coarseness import Coarseness
+from envmap_integrator.preparation.radiosity.gather import block_mean, gather
+from envmap_integrator.preparation.radiosity.irradiance import solve_irradiance
+from envmap_integrator.preparation.radiosity.noise import TARGET, Noise
+from envmap_integrator.transport.path import Transport
 from tests.helpers import Description, at, box, camera, emitting, grey, load, room
 from tests.unit.kit import coarse_mesh
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import pytest
 
-from envmap_integrator.parameters import Parameters
+from envmap_integrator.system.parameters import Parameters
 
 pytestmark = pytest.mark.usefixtures("variant")
 

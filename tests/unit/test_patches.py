@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from envmap_integrator.pipeline import POINTS_PER_PATCH
-from envmap_integrator.radiosity.surface_points import scatter_points
+from envmap_integrator.preparation.coarse_mesh.surface_points import scatter_points
+from envmap_integrator.preparation.pipeline import POINTS_PER_PATCH
 from tests.helpers import at, ball, block, box, load, room, scaled
 from tests.unit.kit import (
     WALL,

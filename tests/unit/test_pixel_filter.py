@@ -8,8 +8,8 @@ import pytest
 from scipy import integrate
 from scipy.stats import qmc
 
-from envmap_integrator.jit import upload
-from envmap_integrator.rendering.pixel_filter import PixelFilter
+from envmap_integrator.imaging.pixel_filter import PixelFilter
+from envmap_integrator.system.jit import upload
 
 pytestmark = pytest.mark.usefixtures("variant")
 

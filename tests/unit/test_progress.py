@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from envmap_integrator import progress
+from envmap_integrator.system import progress
 
 
 @pytest.fixture

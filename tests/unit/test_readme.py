@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 import mitsuba as mi
 import pytest
 
-from envmap_integrator.parameters import Parameters
+from envmap_integrator.system.parameters import Parameters
 from tests.readme import README, documented, plugins, updated
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from envmap_integrator.rendering.sample_points import LANES_ALIKE, SamplePoints
+from envmap_integrator.imaging.sample_points import SamplePoints
+from envmap_integrator.system.jit import LANES_ALIKE
 
 pytestmark = pytest.mark.usefixtures("variant")
 

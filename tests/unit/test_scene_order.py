@@ -7,8 +7,8 @@ import itertools
 import mitsuba as mi
 import pytest
 
-from envmap_integrator.fingerprint import SceneFingerprint, content_digest
-from envmap_integrator.scene_order import ordered_emitters, ordered_shapes
+from envmap_integrator.system.fingerprint import SceneFingerprint, content_digest
+from envmap_integrator.system.scene_order import ordered_emitters, ordered_shapes
 from tests.helpers import at, emitting, grey, load, room
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -48,5 +48,5 @@ def test_the_fingerprint_does_not_depend_on_the_order():
 
 
 def test_what_boxes_tell_apart_is_not_read(monkeypatch):
-    monkeypatch.setattr("envmap_integrator.scene_order.content_digest", None)
+    monkeypatch.setattr("envmap_integrator.system.scene_order.content_digest", None)
     assert len(ordered_shapes(load(room()))) == 4

@@ -12,11 +12,10 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
-from envmap_integrator.maps.clusters import Cluster
-from envmap_integrator.maps.cube import face_to_direction, n_levels
-from envmap_integrator.maps.cube_map import CubeMap
-from envmap_integrator.maps.far_field import far_field
-from envmap_integrator.maps.mipmap import build_levels
+from envmap_integrator.lookup.cube import face_to_direction, n_levels
+from envmap_integrator.lookup.cube_map import Cluster, CubeMap
+from envmap_integrator.lookup.far_field import far_field
+from envmap_integrator.preparation.maps.mipmap import build_levels
 from tests.helpers import (
     QUANTILE,
     at,

@@ -9,19 +9,15 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from envmap_integrator.jit import upload
-from envmap_integrator.radiosity.direct_light import (
+from envmap_integrator.lookup.emitter_choice import Emitters, SourceChoice
+from envmap_integrator.preparation.radiosity.alias_tables import alias_tables, by_weight
+from envmap_integrator.preparation.radiosity.direct_light import (
     RAYS_PER_EMITTER,
     SAMPLES,
     choose_sources,
     survey_direct_light,
 )
-from envmap_integrator.rendering.source_choice import (
-    Emitters,
-    SourceChoice,
-    alias_tables,
-    by_weight,
-)
+from envmap_integrator.system.jit import upload
 from tests.helpers import grey, lamp
 from tests.unit.kit import CoarseMesh, coarse_mesh, scene_of
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from envmap_integrator.radiosity.patch_points import only_standing
-from envmap_integrator.radiosity.spaces import find_spaces, separate
+from envmap_integrator.preparation.coarse_mesh.patch_points import only_standing
+from envmap_integrator.preparation.coarse_mesh.spaces import find_spaces, separate
 from tests.helpers import at, block, box, camera, grey
 from tests.unit.kit import coarse_mesh, scene_of
 

@@ -10,8 +10,8 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from envmap_integrator import storage
-from envmap_integrator.storage import StorageError, Stored, read, write
+from envmap_integrator.system import storage
+from envmap_integrator.system.storage import StorageError, Stored, read, write
 from tests.helpers import at_most, unprivileged
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -230,7 +230,7 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(path, monkeypatch):
         raise RuntimeError("no such compression")
 
     before = path.read_bytes()
-    monkeypatch.setattr("envmap_integrator.storage.OpenEXR.File.write", fail)
+    monkeypatch.setattr("envmap_integrator.system.storage.OpenEXR.File.write", fail)
     with pytest.raises(RuntimeError, match="no such compression"):
         write(path, parts(), METADATA)
     assert path.read_bytes() == before

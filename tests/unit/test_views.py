@@ -6,7 +6,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envmap_integrator.radiosity.views import UNKNOWN, Service, service, usual_service, view_name
+from envmap_integrator.preparation.coarse_mesh.views import (
+    UNKNOWN,
+    Service,
+    service,
+    usual_service,
+    view_name,
+)
 from tests.helpers import box, camera, grey, load, room
 from tests.unit.kit import coarse_mesh, scene_of
 

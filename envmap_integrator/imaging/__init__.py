@@ -1,0 +1,1 @@
+"""From camera samples to pictures: sample points, film, filters."""

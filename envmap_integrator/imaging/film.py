@@ -1,0 +1,193 @@
+"""From camera samples to the film: all samples of a pixel, and the filter of what they gather."""
+
+from __future__ import annotations
+
+from operator import add
+
+import drjit as dr
+import mitsuba as mi
+
+from ..system.interrupt import going_on
+from ..system.jit import give_back
+from ..system.progress import stage
+from ..transport.gathered import Gathered
+from .irradiance_filter import filter_irradiance, pixel_records, tolerance
+from .pixel_filter import PixelFilter
+from .sample_points import SamplePoints
+
+#: What surfaces gather, as AOVs: as in the picture, before pixels share it, and what it's in
+#: proportion to.
+INDIRECT_AOVS = tuple(f"{name}.{c}" for name in ("indirect", "gathered", "albedo") for c in "RGB")
+#: Lanes of a render at least, where it has as many samples (fewer would leave threads idle), and at
+#: most, which is Dr.Jit's limit.
+MIN_LANES, MAX_LANES = 1 << 20, (1 << 32) - 1
+
+
+def most_samples(sensor: mi.Sensor) -> int:
+    """Samples per pixel at most with Mitsuba's samplers, which need a lane for each."""
+    return MAX_LANES // n_pixels_of(sensor.film())
+
+
+def expose(sensor, sampler, spp, seed, shade, names: list[str], aovs) -> None:
+    """Render to the film of a sensor.
+
+    ``sampler`` is one of Mitsuba's, or None for our own sample points. ``shade(sampler, ray,
+    index)`` gives the ``CameraSample`` of the sample of that index, and ``aovs`` the values of it
+    that are to go to channels of the given ``names``.
+    """
+
+    def channels(found, weight):
+        shown = _shown(sensor.film(), found.radiance, found.valid, weight)
+        return [*shown, *(weight * value for value in aovs(found))]
+
+    sensor.film().prepare(names)
+    _put(sensor, _accumulate(sensor, sampler, spp, seed, shade, channels, len(names)))
+
+
+def expose_gathered(sensor, sampler, spp, seed, shade, n_shared: int, with_aovs: bool) -> None:
+    """As ``expose``, with what surfaces gather taken apart and, if asked for, ``INDIRECT_AOVS``.
+
+    Pixels share what they gather with ``n_shared`` rays each, unless that is 0.
+    """
+
+    def channels(found, weight):
+        apart = found.radiance - found.gathered.radiance
+        shown = _shown(sensor.film(), apart, found.valid, weight)
+        return [*shown, *found.gathered.channels()]
+
+    n_guides = Gathered.count()
+    sums = _accumulate(sensor, sampler, spp, seed, shade, channels, n_guides)
+    gathered = Gathered.of_channels(sums[-n_guides:])
+    del sums[-n_guides:]
+    indirect = gathered.radiance
+    aovs = [*rgb(gathered.radiance), *rgb(gathered.albedo)] if with_aovs else []
+    if n_shared:
+        # These are the largest arrays of a render: none outlives its use.
+        records = pixel_records(gathered)
+        del gathered, indirect
+        give_back(dr.width(records))
+        width = int(sensor.film().crop_size()[0])
+        indirect = filter_irradiance(records, width, tolerance(n_shared))
+    for index, value in enumerate(rgb(indirect)):
+        sums[index] += value
+    if with_aovs:
+        sums += [*rgb(indirect), *aovs]
+    sensor.film().prepare(INDIRECT_AOVS if with_aovs else [])
+    _put(sensor, sums)
+
+
+def _put(sensor: mi.Sensor, sums: list[mi.Float]) -> None:
+    """Put sums over the samples of each pixel to a film that is prepared for them."""
+    film = sensor.film()
+    width, height = (int(n) for n in film.crop_size())
+    picture = dr.empty(mi.Float, len(sums) * height * width)
+    first = len(sums) * dr.arange(mi.UInt32, height * width)
+    for index, value in enumerate(sums):
+        dr.scatter(picture, value, first + index)
+    tensor = mi.TensorXf(picture, (height, width, len(sums)))
+    film.put_block(mi.ImageBlock(tensor, film.crop_offset()))
+
+
+def _accumulate(sensor, sampler, spp, seed, shade, channels, n_further) -> list[mi.Float]:
+    """Sums over the samples of each pixel, row by row, of ``channels(found, weight)``."""
+    film = sensor.film()
+    pixel_filter = PixelFilter(film.rfilter())
+    n_pixels, width = n_pixels_of(film), dr.opaque(mi.UInt32, int(film.crop_size()[0]))
+    corner = mi.Vector2i(film.crop_offset())
+
+    def values(sampler, pixel, index):
+        position = mi.Vector2i(pixel % width, pixel // width) + corner
+        return channels(*_sample(sensor, pixel_filter, sampler, shade, position, index))
+
+    with stage("Rendering"):
+        n_channels = len(_shown(film, mi.Spectrum(0), mi.Bool(True), mi.Float(1))) + n_further
+        if sampler is None:
+            sums = _lane_per_pixel(values, n_pixels, spp, seed, n_channels)
+        else:
+            sums = _lane_per_sample(values, n_pixels, spp, seed, n_channels, sampler)
+        dr.eval(sums)
+        dr.sync_thread()
+    return sums
+
+
+def _lane_per_pixel(values, n_pixels, spp, seed, n_channels):
+    """A lane takes the samples of one pixel in turn, or a part of them where pixels are few.
+
+    Nothing is stored for a sample, and neighbouring lanes are neighbouring pixels.
+    """
+    parts = min(-(-MIN_LANES // n_pixels), spp)
+    lane, n_pixels_ = dr.arange(mi.UInt32, n_pixels * parts), dr.opaque(mi.UInt32, n_pixels)
+    pixel, part = lane % n_pixels_, lane // n_pixels_
+    least, longer = (dr.opaque(mi.UInt32, n) for n in divmod(spp, parts))
+    first = part * least + dr.minimum(part, longer)
+    end = first + least + dr.select(part < longer, mi.UInt32(1), 0)
+    sums = [dr.zeros(mi.Float, n_pixels * parts) for _ in range(n_channels)]
+    sums = _sums(values, SamplePoints.of(seed, pixel, spp, first), pixel, end, sums)
+    if parts == 1:
+        return sums
+    dr.eval(sums)
+    parts_ = dr.opaque(mi.UInt32, parts)
+    lanes_of_pixel = lane % parts_ * n_pixels_ + lane // parts_
+    return [dr.block_sum(dr.gather(mi.Float, s, lanes_of_pixel), parts) for s in sums]
+
+
+@dr.syntax
+def _sums(values, points, pixel, end, sums):
+    going = points.index < end
+    while dr.hint(going, label="Samples of a pixel"):
+        sums = [*map(add, sums, values(points, pixel, points.index))]
+        points.advance()
+        going &= (points.index < end) & going_on(points.index)
+    return sums
+
+
+def _lane_per_sample(values, n_pixels, spp, seed, n_channels, sampler):
+    """Mitsuba's samplers want the samples of a pixel side by side."""
+    sampler.set_samples_per_wavefront(spp)
+    sampler.seed(seed, n_pixels * spp)
+    index, spp_ = dr.arange(mi.UInt32, n_pixels * spp), dr.opaque(mi.UInt32, spp)
+    sums = [dr.zeros(mi.Float, n_pixels) for _ in range(n_channels)]
+
+    def trace(sampler, index):
+        pixel = index // spp_
+        for total, value in zip(sums, values(sampler, pixel, index % spp_), strict=True):
+            dr.scatter_add(total, value, pixel)
+        return sampler, index
+
+    def leave(sampler, index):
+        return sampler, index
+
+    dr.if_stmt((sampler, index), going_on(index), trace, leave, mode="symbolic")
+    return sums
+
+
+def _sample(sensor, pixel_filter, sampler, shade, position, index):
+    """The ``CameraSample`` of one sample of each pixel, weighted, and its weight in the pixel."""
+    film = sensor.film()
+    offset, filter_weight = pixel_filter.sample(sampler.next_2d())
+    place = mi.Vector2f(position) + 0.5 + offset
+    within = (place - mi.Vector2f(film.crop_offset())) / mi.Vector2f(film.crop_size())
+    aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+    time = mi.Float(sensor.shutter_open())
+    if sensor.shutter_open_time() > 0:
+        time += sampler.next_1d() * sensor.shutter_open_time()
+    ray, weight = sensor.sample_ray_differential(time, 0, within, aperture)
+    found = shade(sampler, mi.Ray3f(ray), index)
+    return found.scaled(weight * filter_weight), filter_weight
+
+
+def n_pixels_of(film: mi.Film) -> int:
+    """Pixels that a film keeps."""
+    return int(film.crop_size()[0]) * int(film.crop_size()[1])
+
+
+def _shown(film: mi.Film, radiance, valid, weight) -> list[mi.Float]:
+    """What every film holds: colour, alpha if wanted, and the weight of a sample."""
+    wanted = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
+    alpha = [dr.select(valid, weight, 0)] if wanted else []
+    return [*rgb(radiance), *alpha, weight]
+
+
+def rgb(radiance: mi.Spectrum) -> tuple[mi.Float, mi.Float, mi.Float]:
+    """What films hold of a colour."""
+    return tuple(radiance) if len(radiance) == 3 else (radiance[0],) * 3

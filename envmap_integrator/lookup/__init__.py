@@ -1,0 +1,1 @@
+"""What kernels read; nothing here builds it."""

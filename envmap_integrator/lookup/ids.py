@@ -1,0 +1,32 @@
+"""Dense ids of the shapes of a scene, for kernels."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..system.jit import upload
+from ..system.scene_order import ordered_shapes
+
+
+class ObjectIds:
+    """Dense index of the top-level shape under an interaction, as ``ordered_shapes`` counts them.
+
+    Dr.Jit's own registry ids are global to the process and change from run to run; these don't,
+    so what is stored by object id can be saved.
+    """
+
+    def __init__(self, scene: mi.Scene):
+        shapes = mi.ShapePtr(ordered_shapes(scene))
+        registry_ids = dr.reinterpret_array(mi.UInt32, shapes).numpy()
+        table = np.zeros(int(registry_ids.max(initial=0)) + 1, dtype=np.uint32)
+        table[registry_ids] = np.arange(len(registry_ids), dtype=np.uint32)
+        self.count = len(registry_ids)
+        self._table = upload(mi.UInt32, table)
+
+    def __call__(self, si: mi.SurfaceInteraction3f) -> mi.UInt32:
+        shape = dr.reinterpret_array(mi.UInt32, si.shape)
+        instance = dr.reinterpret_array(mi.UInt32, si.instance)
+        index = dr.select(instance != 0, instance, shape)
+        return dr.gather(mi.UInt32, self._table, index, si.is_valid())

@@ -1,0 +1,27 @@
+"""The irradiance cache, as kernels read it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from .patches import Patches
+
+
+@dataclass(frozen=True)
+class IrradianceCache:
+    """Irradiance on the patches; each side of a surface has patches of its own.
+
+    patches   the coarse mesh
+    table     [2 * P * C]  W/m²: row 2p total, row 2p + 1 indirect irradiance of patch p, by C
+                           colour channels
+    """
+
+    patches: Patches
+    table: mi.Float
+
+    def irradiance(self, row: mi.UInt32, active=True) -> mi.Spectrum:
+        """Irradiance [W/m²] in a row of the table."""
+        return dr.gather(mi.Spectrum, self.table, row, active)

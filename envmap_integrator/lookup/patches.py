@@ -1,0 +1,154 @@
+"""The coarse mesh: patches on hashed grids over the surface points of a scene.
+
+A patch is a cell of a grid, restricted to one object and to normals of one dominant direction, so
+that the two sides of a wall, and a book and the table under it, never share one. Large cells
+choose how finely they are divided by how densely surface points lie in them: the number of patches
+is bounded by a budget and doesn't depend on the number of triangles. The patch of a surface point
+is found from its position, normal and shape alone, by two packed gathers without a loop.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..system.jit import mix
+
+#: Parts of a patch that are told apart: the octants of its cell.
+PARTS = 8
+#: Entries of a bucket of the hash tables, read by one packed gather.
+BUCKET = 4
+#: Bits of an entry that don't belong to the fingerprint: of the large cells' table, which hold the
+#: level, and of the patches'.
+LEVEL_BITS, MARK_BITS = 4, 2
+#: Marks of a patch: direct light is uneven over it, and it has been left out.
+UNEVEN, DROPPED = 1, 2
+
+
+@dataclass(frozen=True)
+class Patches:
+    """Two hash tables: large cell → level of division, cell of that level → patch.
+
+    A patch's index is the place of its entry in the table. An entry is a fingerprint of the cell;
+    where a bucket overflows, the patch is left out (about one in 10⁴).
+
+    origin      [3]              corner of the grids, world space
+    size        [1]              edge of a large cell, world units
+    levels      [4 * buckets]    fingerprint and level of each large cell, 0 where empty
+    cells       [P]              fingerprint and marks of each patch, 0 where empty
+    use_objects                  whether the object id tells cells apart (not with too many objects)
+    """
+
+    origin: mi.Point3f
+    size: mi.Float
+    levels: mi.UInt32
+    cells: mi.UInt32
+    use_objects: bool
+
+    @property
+    def count(self) -> int:
+        """Number of patch indices P, used or not."""
+        return dr.width(self.cells)
+
+    def find_cell(self, p, normal, object_id, active=True):
+        """Look up the large cell of an oriented surface point.
+
+        Returns ``(cell, size, found)``: the index of the cell, the edge of the patches in it in
+        world units, and whether there is such a cell.
+        """
+        identity = self.identity_of(normal, object_id)
+        entry, found, cell = self._probe(self.levels, p, identity, mi.UInt32(0), LEVEL_BITS, active)
+        level = entry & ((1 << LEVEL_BITS) - 1)
+        return cell, self.size / mi.Float(mi.UInt32(1) << level), found
+
+    def find(self, p, normal, object_id, size, active=True, u=None):
+        """Look up the patch of an oriented surface point in a cell with patches of edge ``size``.
+
+        Returns ``(patch, found, even, own)``. Surfaces too small to have been hit have no patch;
+        where direct light isn't ``even``, the patch's irradiance stands for indirect light alone.
+        ``own`` is the patch that the point itself lies in, P if there is none.
+
+        With ``u``, uniform in the unit square, the point is moved at random by up to half a patch
+        along the surface: the expectation interpolates between patches, so their borders don't
+        show. Where the moved point belongs to no patch (beyond an edge of the surface), the patch
+        of the point itself is taken; where that one has been left out, there is none.
+        """
+        level = mi.UInt32(dr.log2(self.size / size) + 0.5)
+        identity = self.identity_of(normal, object_id)
+        marks, exists, own = self._probe(self.cells, p, identity, level, MARK_BITS, active)
+        dropped = exists & ((marks & DROPPED) != 0)
+        found = exists & ~dropped
+        own_or_none = dr.select(exists, own, dr.opaque(mi.UInt32, self.count))
+        if u is None:
+            return own, found, (marks & UNEVEN) == 0, own_or_none
+
+        frame = mi.Frame3f(normal)
+        moved = p + size * (frame.s * (u.x - 0.5) + frame.t * (u.y - 0.5))
+        # Low bits of u tilt the normal too: curved surfaces change dominant direction smoothly.
+        v = mi.Point2f(256 * u.x - dr.floor(256 * u.x), 256 * u.y - dr.floor(256 * u.y))
+        tilted = normal + 0.4 * (frame.s * (v.x - 0.5) + frame.t * (v.y - 0.5))
+        around = self.identity_of(tilted, object_id)
+        # What has been left out isn't served by its neighbours: it's unlike them.
+        entry, hit, patch = self._probe(
+            self.cells, moved, around, level, MARK_BITS, active & ~dropped
+        )
+        hit &= (entry & DROPPED) == 0
+        even = ((marks | dr.select(hit, entry, 0)) & UNEVEN) == 0
+        return dr.select(hit, patch, own), found | hit, even, own_or_none
+
+    def part(self, p, size) -> mi.UInt32:
+        """Which of its parts a point lies in, in a patch of edge ``size``."""
+        half = dr.floor((p - self.origin) * (2 / size))
+        half = mi.Vector3u(mi.Vector3i(half) & 1)
+        return half.x + 2 * half.y + 4 * half.z
+
+    def identity_of(self, normal, object_id):
+        """What tells patches in the same cell apart."""
+        direction = normal_direction(normal)
+        return direction + object_id * 8 if self.use_objects else direction
+
+    def _probe(self, table, p, identity, level, payload_bits, active):
+        """Look for a cell in a table: ``(entry, found, index)``."""
+        scale = mi.Float(mi.UInt32(1) << level) / self.size
+        cell = mi.Vector3i(dr.floor((p - self.origin) * scale))
+        slot, fingerprint = cell_hash(cell, identity, level)
+        # As data: tables of other sizes compile nothing.
+        bucket = slot & dr.opaque(mi.UInt32, dr.width(table) // BUCKET - 1)
+        entries = dr.gather(mi.Vector4u, table, bucket, active)
+        found, index, entry = mi.Bool(False), mi.UInt32(0), mi.UInt32(0)
+        for i in range(BUCKET):
+            match = active & (entries[i] >> payload_bits == fingerprint >> payload_bits)
+            index = dr.select(match, bucket * BUCKET + i, index)
+            entry = dr.select(match, entries[i], entry)
+            found |= match
+        return entry, found, index
+
+
+def normal_direction(normal):
+    """Dominant signed axis of a direction, 0 … 5.
+
+    The frame is turned a little, so that 45 degree faces, common in buildings, don't fall on a tie.
+    """
+    n = mi.Vector3f(
+        dr.dot(normal, mi.Vector3f(0.978, 0.163, -0.130)),
+        dr.dot(normal, mi.Vector3f(-0.147, 0.981, 0.126)),
+        dr.dot(normal, mi.Vector3f(0.148, -0.104, 0.983)),
+    )
+    a = dr.abs(n)
+    axis = dr.select(a.x >= dr.maximum(a.y, a.z), mi.UInt32(0), dr.select(a.y >= a.z, 1, 2))
+    component = dr.select(axis == 0, n.x, dr.select(axis == 1, n.y, n.z))
+    return 2 * axis + dr.select(component < 0, mi.UInt32(1), mi.UInt32(0))
+
+
+def cell_hash(cell, identity, level):
+    """Two independent hashes of a cell: its slot and its fingerprint.
+
+    Fingerprints aren't zero, also without the bits that a level takes in their place.
+    """
+    c = dr.reinterpret_array(mi.Vector3u, cell)
+    name = identity * 16 + level
+    slot = mix(c.x * 0x8DA6B343 + c.y * 0xD8163841 + c.z * 0xCB1AB31F + name * 0x9E3779B1)
+    fingerprint = mix(c.x * 0xC2B2AE3D + c.y * 0x27D4EB2F + c.z * 0x165667B1 + name * 0x85EBCA77)
+    return slot, fingerprint | (1 << LEVEL_BITS)

@@ -1,0 +1,1 @@
+"""What is made before rendering, in the order of the paper."""

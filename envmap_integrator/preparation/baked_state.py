@@ -1,0 +1,239 @@
+"""The baked state of a scene: what it depends on, what it holds, and its files."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, field, fields, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..lookup.cube_map import CubeMap, from_stored, to_parts
+from ..lookup.irradiance_cache import IrradianceCache
+from ..lookup.patches import BUCKET, Patches
+from ..system.fingerprint import difference
+from ..system.jit import opaque_point, upload
+from ..system.storage import StorageError, Stored, read, write
+from .coarse_mesh.views import Service
+from .maps.clusters import ClusterRequest
+
+#: Patches that a render is worth, at least and at most, and camera samples for which there is one.
+#: Renders of nearly the same size get the same: there are few steps of the size in between.
+LEAST_PATCHES, MOST_PATCHES, SAMPLES_PER_PATCH = 8192, 16384, 1536
+STEPS_PER_OCTAVE = 2
+#: Gather rays for each camera sample, about; of a patch at most: all are kept until it's solved.
+GATHER_SHARE, MOST_PATCH_SAMPLES = 1 / 16, 256
+#: Gather rays that may be added for each camera sample, and at least and at most in all.
+MORE_SHARE, LEAST_MORE, MOST_MORE = 1 / 4, 1 << 21, 1 << 23
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the pre-passes depend on besides the scene; see the integrators for the meanings.
+
+    ``patches`` and ``patch_samples`` are None until the size of a render decides, which also gives
+    ``more_rays``: gather rays that may be added where light is rare.
+    """
+
+    patches: int | None
+    patch_samples: int | None
+    least_patch_samples: int
+    more_rays: int = 0
+    maps: bool = False
+    map_resolution: int = 0
+    map_samples: int = 0
+    distance_ratio: float = 0.0
+    map_mirrors: bool = False
+    map_always: bool = False
+    requests: tuple[ClusterRequest, ...] = ()
+
+    def for_render(self, n_samples: int) -> Settings:
+        """With a coarse mesh and a cache as fine as so many camera samples are worth.
+
+        So the pre-passes take a small part of the time of a render, and their error falls with its
+        noise.
+        """
+        patches = self.patches
+        if patches is None:
+            worth = max(n_samples / SAMPLES_PER_PATCH / LEAST_PATCHES, 1)
+            octaves = round(STEPS_PER_OCTAVE * math.log2(worth)) / STEPS_PER_OCTAVE
+            patches = min(int(LEAST_PATCHES * 2**octaves), MOST_PATCHES)
+        samples = self.patch_samples
+        if samples is None:
+            most = int(GATHER_SHARE * n_samples / patches)
+            samples = max(1 << most.bit_length() >> 1, self.least_patch_samples)
+            samples = min(samples, MOST_PATCH_SAMPLES)
+        more = min(max(int(MORE_SHARE * n_samples), LEAST_MORE), MOST_MORE)
+        more = LEAST_MORE if self.patch_samples else 1 << more.bit_length() - 1
+        return replace(self, patches=patches, patch_samples=samples, more_rays=more)
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """The baked state of a scene, for all views of what some sensors see.
+
+    key                content hash of the scene, and the settings
+    cache              irradiance on the patches
+    sources            [R * L * 4]  probabilities of the emitters (``SourceChoice.table``),
+    source_rows        [C]          ... and which row is each large cell's
+    views              names (``view_name``) of the sensors that it was made for,
+    service            ... and what the coarse mesh does for them
+    relative_error     [1]          error of the brightness of their pictures, of the worst, that
+                                    comes from the noise of the cache and the size of the patches
+    maps               one cube map per cluster
+    cluster_of_cell    cluster index of each large cell, ``len(maps)`` where there is none
+    stage_times        seconds spent in each stage
+    """
+
+    key: str
+    cache: IrradianceCache
+    sources: mi.Float
+    source_rows: mi.UInt32
+    views: tuple[str, ...]
+    service: Service
+    relative_error: float
+    maps: tuple[CubeMap, ...] = ()
+    cluster_of_cell: np.ndarray | None = None
+    stage_times: dict[str, float] = field(default_factory=dict)
+
+    def save(self, path) -> None:
+        """Write the state to an OpenEXR file, for ``cache_file`` and ``mipmap_cube``."""
+        save(path, self)
+
+
+# ---------------------- Files ----------------------
+
+#: Width of the images that hold one-dimensional arrays.
+_WIDTH = 1024
+
+
+def save(path, prepared: Prepared) -> None:
+    """Write a prepared state to an OpenEXR file."""
+    patches = prepared.cache.patches
+    parts = {
+        "patches": {"fingerprint": _image(patches.cells.numpy())},
+        "levels": {"entry": _image(patches.levels.numpy())},
+        "irradiance": {"Y": _image(prepared.cache.table.numpy())},
+        "sources": {"alias": _image(prepared.sources.numpy())},
+        "source_rows": {"row": _image(prepared.source_rows.numpy())},
+    }
+    if prepared.cluster_of_cell is not None:
+        parts["cluster_of_cell"] = {"cluster": _image(prepared.cluster_of_cell)}
+    maps = []
+    for index, cube_map in enumerate(prepared.maps):
+        map_parts, map_metadata = to_parts(cube_map, prefix=f"map{index}/")
+        parts |= map_parts
+        maps.append(map_metadata)
+    metadata = {
+        "key": prepared.key,
+        "origin": [float(c[0]) for c in patches.origin],
+        "size": float(patches.size[0]),
+        "levels": dr.width(patches.levels),
+        "patches": patches.count,
+        "use_objects": patches.use_objects,
+        "channels": len(mi.Spectrum()),
+        "sources": dr.width(prepared.sources),
+        "source_rows": dr.width(prepared.source_rows),
+        "views": list(prepared.views),
+        "service": [asdict(prepared.service)],
+        "relative_error": prepared.relative_error,
+        "maps": maps,
+        "stage_times": prepared.stage_times,
+    }
+    write(path, parts, metadata)
+
+
+def load(path, key: str, owner: str, n_emitters: int) -> Prepared:
+    """Read a prepared state; ``ValueError`` if the file holds none that belongs to ``key``.
+
+    ``n_emitters`` is the number of emitters of the scene.
+    """
+    path = mi.file_resolver().resolve(path)
+    try:
+        return _prepared(read(path, "make it again with envmap-render bake"), key, n_emitters)
+    except StorageError as error:
+        raise ValueError(f'{owner}: "cache_file" {error}') from None
+
+
+def _prepared(stored: Stored, key: str, n_emitters: int) -> Prepared:
+    difference = _difference(stored.text("key"), key)
+    if difference:
+        raise stored.refusal(difference)
+
+    def values(part, channel, dtype, count):
+        found = stored.array(part, channel, dtype).ravel()[:count]
+        if len(found) < count:
+            raise stored.refusal(f'its part "{part}" holds {len(found)} values of {count}')
+        return found
+
+    n_cells = stored.integer("levels", BUCKET)
+    n_patches = stored.integer("patches", BUCKET)
+    n_channels = len(mi.Spectrum())
+    patches = Patches(
+        origin=opaque_point(stored.point("origin")),
+        size=dr.opaque(mi.Float, stored.number("size")),
+        levels=upload(mi.UInt32, values("levels", "entry", np.uint32, n_cells)),
+        cells=upload(mi.UInt32, values("patches", "fingerprint", np.uint32, n_patches)),
+        use_objects=stored.flag("use_objects"),
+    )
+    table = values("irradiance", "Y", np.float32, 2 * n_patches * n_channels)
+
+    # What kernels look up has to be there: they don't check.
+    n_sources = stored.integer("sources", 4 * n_emitters)
+    sources = values("sources", "alias", np.float32, n_sources)
+    rows = values("source_rows", "row", np.uint32, stored.integer("source_rows", 1))
+    other = sources[1::4]
+    n_rows = n_sources // (4 * n_emitters)
+    if rows.max() >= n_rows or not np.all((other >= 0) & (other < n_emitters)):
+        raise stored.refusal(f"its sources aren't {n_rows} rows for {n_emitters} emitters")
+    maps = tuple(
+        from_stored(entry, prefix=f"map{index}/")
+        for index, entry in enumerate(stored.entries("maps"))
+    )
+    if any(cube_map.n_channels != n_channels for cube_map in maps):
+        raise stored.refusal(f"its maps haven't {n_channels} colour channels")
+    (service,) = stored.entries("service")
+    membership = None
+    if maps or "cluster_of_cell" in stored.parts:
+        membership = values("cluster_of_cell", "cluster", np.uint32, n_cells)
+        if membership.max() > len(maps):
+            raise stored.refusal(f"its clusters are more than its {len(maps)} maps")
+    return Prepared(
+        stored.text("key"),
+        IrradianceCache(patches, upload(mi.Float, table)),
+        upload(mi.Float, sources),
+        upload(mi.UInt32, rows),
+        tuple(stored.texts("views")),
+        Service(service.number("found"), service.number("patches")),
+        stored.number("relative_error"),
+        maps,
+        membership,
+        stored.numbers("stage_times"),
+    )
+
+
+def _difference(theirs: str, ours: str) -> str:
+    """What tells the key of a state (``Prepared.key``) from ours, in words; nothing if they agree.
+
+    A key is a scene's hash and the text of ``Settings``.
+    """
+    if theirs == ours:
+        return ""
+    (scene, settings), (our_scene, our_settings) = (k.partition(" ")[::2] for k in (theirs, ours))
+    if scene != our_scene:
+        differing = difference(scene, our_scene)
+        return "made for another scene" + (f": it has other {differing}" if differing else "")
+    last = len(fields(Settings)) - 1
+    each = (text.split(", ", last) for text in (settings, our_settings))
+    pairs = ((a, b) for a, b in zip(*each, strict=False) if a != b)
+    a, b = (text.removeprefix("Settings(") for text in next(pairs, (settings, our_settings)))
+    return f"made with {a}, not {b}"
+
+
+def _image(values: np.ndarray) -> np.ndarray:
+    """A one-dimensional array as an image, padded with zeros."""
+    height = max(-(-len(values) // _WIDTH), 1)
+    image = np.zeros(height * _WIDTH, dtype=values.dtype)
+    image[: len(values)] = values
+    return image.reshape(height, _WIDTH)

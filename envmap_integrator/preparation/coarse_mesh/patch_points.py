@@ -1,0 +1,94 @@
+"""The surface points that stand for each patch."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.sparse import coo_matrix
+
+from ...lookup.patches import PARTS, Patches
+from ...system.jit import upload
+from .surface_points import SurfacePoints
+
+#: Parts of the box about a patch's points along each axis in which rays start equally often.
+STRATA = 4
+
+
+class PatchPoints:
+    """Surface points sorted by patch, from which rays start at random.
+
+    patches   [K]      indices of the patches that have points
+    first     [K + 1]  where the points of each begin
+    index              which points stand for patches, sorted
+    points             all surface points
+    """
+
+    def __init__(self, points: SurfacePoints, patch_of_point: np.ndarray, n_patches: int):
+        standing = np.flatnonzero(patch_of_point >= 0)
+        # Rows of a sparse matrix: a counting sort.
+        place = patch_of_point[standing], np.arange(len(standing))
+        by_patch = coo_matrix((standing, place), (n_patches, len(standing))).tocsr()
+        self.patches = np.flatnonzero(np.diff(by_patch.indptr))
+        self.first = np.append(by_patch.indptr[self.patches], len(standing)).astype(np.uint32)
+        self.points = points
+        key = self._parts(points.position[by_patch.data])
+        order = np.argsort(key, kind="stable")
+        self.index = by_patch.data[order]
+        part, first_of_part = np.unique(key[order], return_index=True)
+        first_part = np.searchsorted(part, STRATA**3 * np.arange(len(self.patches) + 1))
+        self._first_part = upload(mi.UInt32, first_part)
+        self._first_of_part = upload(mi.UInt32, np.append(first_of_part, len(key)))
+        self._index = upload(mi.UInt32, self.index)
+
+    def _parts(self, position: np.ndarray) -> np.ndarray:
+        """Number of the part of a patch in which each point lies, ascending from patch to patch."""
+        first = self.first[:-1].astype(np.int64)
+        key = np.repeat(np.arange(len(first)), np.diff(self.first.astype(np.int64)))
+        if len(first) == 0:
+            return key
+        rank = key
+        for x in position.T.astype(np.float64):
+            low, high = (f.reduceat(x, first)[rank] for f in (np.minimum, np.maximum))
+            slice_ = (x - low) * (STRATA / np.maximum(high - low, np.finfo(np.float32).tiny))
+            key = STRATA * key + np.minimum(slice_.astype(np.int64), STRATA - 1)
+        return key
+
+    def sample(self, rank: mi.UInt32, u: mi.Float) -> mi.UInt32:
+        """Index of a random surface point of the ``rank``-th patch.
+
+        Each part of the patch that has points is as likely as another: walks come to one side of it
+        a hundred times as often as to the other where they look through a slit.
+        """
+        part, u = _among(self._first_part, rank, u)
+        k, _ = _among(self._first_of_part, part, u)
+        return dr.gather(mi.UInt32, self._index, k)
+
+
+def _among(first: mi.UInt32, group: mi.UInt32, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+    """One of the places of a group, all as likely, and what is left of the random number."""
+    begin = dr.gather(mi.UInt32, first, group)
+    n = dr.gather(mi.UInt32, first, group + 1) - begin
+    u *= mi.Float(n)
+    k = dr.minimum(mi.UInt32(u), n - 1)
+    return begin + k, u - mi.Float(k)
+
+
+def only_standing(
+    points: SurfacePoints, patches: Patches, patch_of_point: np.ndarray
+) -> np.ndarray:
+    """The patch of every surface point [N] that stands for it, -1 for the others.
+
+    In the parts of a patch that walks from the sensors have come to, only their points stand for
+    it: global lines also hit what no light reaches, such as the floor under a cupboard, which would
+    darken what looks out.
+    """
+    if len(points) == 0:  # Nothing but mirrors and glass.
+        return patch_of_point
+    place = points.places()
+    _, size, _ = patches.find_cell(*place)
+    part = PARTS * patch_of_point + patches.part(place[0], size).numpy()
+    has_patch, seen = patch_of_point >= 0, points.seen > 0
+    visited = np.zeros(PARTS * patches.count, dtype=bool)
+    visited[part[has_patch & seen]] = True
+    return np.where(has_patch & (seen | ~visited[part]), patch_of_point, -1)

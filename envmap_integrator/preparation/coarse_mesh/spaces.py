@@ -1,0 +1,193 @@
+"""Spaces that walls close off from each other: what is true in one room says nothing of the next.
+
+A patch or a cluster on both sides of a wall, however thin, would let light through it.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from ...lookup.ids import ObjectIds
+from ...lookup.patches import Patches
+from ...system.jit import upload
+from ...system.ray_counts import Ray, count
+from .build import drop
+from .surface_points import SurfacePoints
+
+#: Pairs of points on walks that are tested for sight of each other.
+PAIRS = 1 << 15
+#: Points on walks that another point is tested against, until it sees one.
+TRIES = 16
+#: Cosine below which nothing is seen: by rounding, the two sides of a wall face each other.
+GRAZING = 0.02
+#: An unknown space, -1, in an array of Dr.Jit.
+UNKNOWN = 0xFFFFFFFF
+#: Places around each point from which patches are looked up, within a patch's size.
+LOOKS = 16
+
+
+def find_spaces(
+    scene: mi.Scene, points: SurfacePoints, patch_of_point: np.ndarray, seed: int = 0
+) -> np.ndarray:
+    """The space [N] of every surface point, counted from 0; -1 where it isn't known.
+
+    A walk stays in the space of its sensor. Sensors are in the same one if their walks see each
+    other. Other points are in that of a walk that they see, which is tested only for those that
+    stand for patches. Without sensors, all is one space.
+    """
+    walk = points.seen.astype(np.int64)
+    walked = np.flatnonzero(walk)
+    if len(walked) == 0:
+        return np.zeros(len(points), dtype=np.int64)
+    space = np.where(walk > 0, 0, -1)
+    sight = _Sight(scene, points)
+    if walk.max() > 1:
+        a, b = np.random.default_rng(seed).choice(walked, (2, PAIRS))
+        linked = sight(upload(mi.UInt32, a), upload(mi.UInt32, b)).numpy()
+        ends = walk[a[linked]], walk[b[linked]]
+        n_nodes = int(walk.max()) + 1  # The first stands for no sensor.
+        links = coo_matrix((np.ones(linked.sum()), ends), (n_nodes, n_nodes))
+        space = connected_components(links, directed=False)[1][walk] - 1
+    others = np.flatnonzero((patch_of_point >= 0) & (walk == 0))
+    if len(others):
+        space[others] = space[sight.first_seen(others, walked, seed)]
+    return space
+
+
+class _Sight:
+    """Which surface points see each other."""
+
+    def __init__(self, scene: mi.Scene, points: SurfacePoints):
+        self._scene = scene
+        self._points = points
+
+    def __call__(self, a: mi.UInt32, b: mi.UInt32, active: mi.Bool | bool = True) -> mi.Bool:
+        """Do the points of indices ``a`` and ``b`` see each other?"""
+        a, b = self._points.interaction(a), self._points.interaction(b)
+        d = dr.normalize(b.p - a.p)
+        ray, back = a.spawn_ray(d), b.spawn_ray(-d)
+        # Up to the very end: rays to a point stop short of it by more than a wall may be away.
+        between = back.o - ray.o
+        ray.maxt = dr.norm(between)
+        ray.d = between / ray.maxt
+        active = active & (dr.dot(d, a.n) > GRAZING) & (dr.dot(-d, b.n) > GRAZING)
+        count(Ray.SURVEY, ray, active)
+        return active & ~self._scene.ray_test(ray, active)
+
+    def first_seen(self, points: np.ndarray, targets: np.ndarray, seed: int) -> np.ndarray:
+        """For each of ``points``, the first of a few random ``targets`` that it sees.
+
+        Takes and returns indices, a point's own where it saw none.
+        """
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(seed, len(points))
+        return _first_seen(
+            self, upload(mi.UInt32, points), upload(mi.UInt32, targets), len(targets), sampler
+        ).numpy()
+
+
+@dr.syntax
+def _first_seen(sight, point, targets, n_targets, sampler):
+    seen = mi.UInt32(point)
+    n = dr.opaque(mi.UInt32, n_targets)
+    tries = mi.UInt32(0)
+    active = mi.Bool(True)
+    while dr.hint(active, exclude=[sight, targets], label="Look for points on walks"):
+        k = dr.minimum(mi.UInt32(sampler.next_1d() * mi.Float(n)), n - 1)
+        target = dr.gather(mi.UInt32, targets, k, active)
+        found = sight(point, target, active)
+        seen = dr.select(found, target, seen)
+        tries += 1
+        active &= ~found & (tries < TRIES)
+    return seen
+
+
+def separate(
+    scene: mi.Scene,
+    object_ids: ObjectIds,
+    patches: Patches,
+    points: SurfacePoints,
+    patch_of_point: np.ndarray,
+    cell_of_point: np.ndarray,
+    space: np.ndarray,
+    seed: int = 0,
+) -> tuple[Patches, np.ndarray, np.ndarray]:
+    """Drop patches that might bring light from one space to another.
+
+    These are the ones in several spaces, the ones that aren't known to be in any, as what they
+    look at might be closed off from all sensors, and the ones that are looked up from a space that
+    isn't their own. In the usual case of a single space there are none of the last kind, whatever
+    closed rooms and boxes no sensor comes to: what is left has been seen from the sensors' space.
+
+    Returns the remaining patches and, of every surface point [N], the patch and the large cell,
+    -1 where it has none, where its space isn't known and where the cell lies in several.
+    """
+    standing = patch_of_point >= 0
+    patch = patch_of_point[standing]
+    space_of_patch = np.full(patches.count, -1)
+    space_of_patch[patch] = space[standing]
+    space_of_patch[patch[space_of_patch[patch] != space[standing]]] = -1
+    dropped = space_of_patch < 0
+    cell_of_point = np.where(space < 0, -1, cell_of_point)
+    if space.max(initial=0) > 0:
+        foreign, mixed = _look_around(
+            scene, object_ids, patches, points, space, space_of_patch, seed
+        )
+        dropped |= foreign
+        cell_of_point = np.where(mixed[cell_of_point], -1, cell_of_point)
+    return *drop(patches, patch_of_point, dropped), cell_of_point
+
+
+def _looked_at(scene, object_ids, patches, si, space_of_patch, sampler, active) -> mi.UInt32:
+    """The space of the patch that a random ray from each point hits, ``UNKNOWN`` if none."""
+    direction = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
+    ray = si.spawn_ray(mi.Frame3f(si.n).to_world(direction))
+    count(Ray.SURVEY, ray, active)
+    hit = scene.ray_intersect(ray, active)
+    normal, objects = dr.mulsign(hit.n, -dr.dot(hit.n, ray.d)), object_ids(hit)
+    _, size, found = patches.find_cell(hit.p, normal, objects, active & hit.is_valid())
+    patch, found, *_ = patches.find(hit.p, normal, objects, size, found)
+    return dr.select(found, dr.gather(mi.UInt32, space_of_patch, patch, found), UNKNOWN)
+
+
+def _look_around(scene, object_ids, patches, points, space, space_of_patch, seed):
+    """Which patches [P] are looked up from other spaces, which large cells [C] from several.
+
+    Tested from all points: walks hardly come to the nooks by a wall, but paths of the renderer do.
+    """
+    n_lanes = LOOKS * len(points)
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, n_lanes)
+    lane = dr.arange(mi.UInt32, n_lanes) // LOOKS
+    space_of_patch = upload(mi.UInt32, space_of_patch)
+    si = points.interaction(lane)
+    object_id = dr.gather(mi.UInt32, upload(mi.UInt32, points.object_id), lane)
+
+    # ---- Where no walk came, a point is in the space of what it looks at ----
+    own = dr.gather(mi.UInt32, upload(mi.UInt32, space), lane)
+    seen = _looked_at(scene, object_ids, patches, si, space_of_patch, sampler, own == UNKNOWN)
+    own = dr.select(own == UNKNOWN, seen, own)
+    known = own != UNKNOWN
+
+    # ---- Twice as far as the renderer jitters its look-ups, to be on the safe side ----
+    _, size, found = patches.find_cell(si.p, si.n, object_id, known)
+    u = sampler.next_2d()
+    frame = mi.Frame3f(si.n)
+    p = si.p + size * (frame.s * (u.x - 0.5) + frame.t * (u.y - 0.5))
+    cell, size, found = patches.find_cell(p, si.n, object_id, found)
+    patch, has_patch, *_ = patches.find(p, si.n, object_id, size, found, sampler.next_2d())
+
+    other = dr.gather(mi.UInt32, space_of_patch, patch, has_patch) != own
+    foreign = dr.zeros(mi.Bool, patches.count)
+    dr.scatter(foreign, mi.Bool(True), patch, has_patch & other)
+    n_cells = dr.width(patches.levels)
+    first = dr.full(mi.UInt32, int(space.max()) + 1, n_cells)
+    last = dr.zeros(mi.UInt32, n_cells)
+    dr.scatter_reduce(dr.ReduceOp.Min, first, own, cell, found)
+    dr.scatter_reduce(dr.ReduceOp.Max, last, own, cell, found)
+    dr.eval(foreign, first, last)
+    return foreign.numpy(), first.numpy() < last.numpy()

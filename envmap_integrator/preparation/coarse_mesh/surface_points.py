@@ -1,0 +1,345 @@
+"""Points spread over the surfaces of a scene, found by casting rays.
+
+Rays reach every shape that can be hit, whatever its type: merged meshes, instances, spheres,
+curves. The cost doesn't depend on the number of triangles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...lookup.ids import ObjectIds
+from ...system.jit import mean_channel, upload, upload_vectors
+from ...system.ray_counts import Ray, count
+
+#: Hits followed along each global line, and along each walk from a sensor.
+LINE_HITS, WALK_HITS = 8, 4
+#: Batches of rays cast at most to find about as many points as asked for, what share of them is
+#: enough, and how many times as many rays may be cast as if none were lost.
+MAX_BATCHES, ENOUGH, MAX_RAYS = 4, 0.9, 8
+#: Choices among the lobes of a material in which its diffuse one is looked for.
+LOBES = 8
+#: Cosine of the angle by which rounding may turn a normal.
+UNTURNED = 1 - 1e-5
+#: Points from which the extent of all is told.
+EXTENT_POINTS = 1 << 14
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Oriented points on surfaces; a point belongs to the side from which it was hit.
+
+    position        [N, 3]  world space
+    normal          [N, 3]  geometric normal, facing the side the point belongs to
+    shading_normal  [N, 3]  shading normal of the material, on the same side
+    object_id       [N]     dense index of the top-level shape (``ObjectIds``)
+    seen            [N]     1 + the sensor's index for a point on a walk from it, 0 on a global line
+    turned          [N]     whether a bump or normal map turns the shading normal
+    bounce          [N]     which hit of its walk or line it is, from 0
+    reflects        [N]     weight with which its walk has gone on, mean of the colour channels; 0
+                            on a line
+    """
+
+    position: np.ndarray
+    normal: np.ndarray
+    shading_normal: np.ndarray
+    object_id: np.ndarray
+    seen: np.ndarray
+    turned: np.ndarray
+    bounce: np.ndarray
+    reflects: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+    @cached_property
+    def box(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest corner [3] of all points."""
+        low_high = np.zeros((2, 3), self.position.dtype)
+        if len(self):
+            axes = np.ascontiguousarray(self.position.T)  # Ten times as fast in NumPy.
+            low_high[:] = axes.min(axis=1), axes.max(axis=1)
+        return low_high[0], low_high[1]
+
+    @cached_property
+    def extent(self) -> float:
+        """Diagonal of the box that holds most points, of walks if there are any."""
+        if len(self) == 0:
+            return 1.0
+        seen = self.seen > 0
+        some = self.position[seen] if seen.any() else self.position
+        low, high = np.percentile(some[:: max(len(some) // EXTENT_POINTS, 1)], [2, 98], axis=0)
+        return max(float(np.linalg.norm(high - low)), 1e-30)
+
+    def interaction(self, index: mi.UInt32) -> mi.SurfaceInteraction3f:
+        """The points of the given indices, as interactions from which rays can start."""
+        position, normal, shading_normal = self._vectors
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(index))
+        si.p = dr.gather(mi.Point3f, position, index)
+        si.n = dr.gather(mi.Normal3f, normal, index)
+        si.sh_frame = mi.Frame3f(dr.gather(mi.Normal3f, shading_normal, index))
+        si.t = 0
+        return si
+
+    def is_turned(self, index: mi.UInt32) -> mi.Bool:
+        """``turned`` of the points of the given indices."""
+        return dr.gather(mi.UInt32, self._turned, index) != 0
+
+    @cached_property
+    def _turned(self) -> mi.UInt32:
+        return upload(mi.UInt32, self.turned)
+
+    @cached_property
+    def _vectors(self) -> tuple[mi.Float, mi.Float, mi.Float]:
+        """Positions and normals [3 * N] where kernels can read them."""
+        return tuple(
+            upload(mi.Float, vectors)
+            for vectors in (self.position, self.normal, self.shading_normal)
+        )
+
+    def places(self) -> tuple[mi.Point3f, mi.Normal3f, mi.UInt32]:
+        """All points as kernels look them up in a coarse mesh: position, normal and object id."""
+        return (
+            upload_vectors(mi.Point3f, self.position),
+            upload_vectors(mi.Normal3f, self.normal),
+            upload(mi.UInt32, self.object_id),
+        )
+
+    def take(self, index: np.ndarray) -> SurfacePoints:
+        """The points of the given indices, in that order."""
+        return SurfacePoints(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+
+    @staticmethod
+    def concatenate(parts: list[SurfacePoints]) -> SurfacePoints:
+        return SurfacePoints(
+            *(
+                np.concatenate([getattr(part, name) for part in parts])
+                for name in SurfacePoints.__dataclass_fields__
+            )
+        )
+
+
+@dr.syntax
+def diffuse_normal(bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Normal3f:
+    """Shading normal about which a material reflects diffusely, in world space.
+
+    Bump and normal maps turn it without telling: it's where they send the middle of their
+    cosine-distributed directions.
+    """
+    normal = mi.Normal3f(si.sh_frame.n)
+    i, pending = mi.UInt32(0), mi.Bool(active)
+    while dr.hint(pending, exclude=[bsdf, si], label="Look for the diffuse lobe"):
+        lobe = 1 - (mi.Float(i) + 0.5) / LOBES  # The diffuse one comes last in most materials.
+        bs, _ = bsdf.sample(mi.BSDFContext(), si, lobe, mi.Point2f(0.5), pending)
+        found = pending & mi.has_flag(bs.sampled_type, mi.BSDFFlags.DiffuseReflection)
+        normal = dr.select(found, mi.Normal3f(si.to_world(bs.wo)), normal)
+        i += 1
+        pending &= ~found & (i < LOBES)
+    return normal
+
+
+def scatter_points(
+    scene: mi.Scene,
+    object_ids: ObjectIds,
+    count: int,
+    sensors: list[mi.Sensor],
+    mirrors: bool = False,
+    seed: int = 0,
+) -> SurfacePoints:
+    """Spread about ``count`` points over the surfaces that matter to ``sensors``.
+
+    Half come from walks that start at the sensors and follow the BSDFs: that is where the renderer
+    will ask. Half come from global lines, uniform in position and direction around each sensor's
+    walks, which hit all surfaces there in proportion to their area (Cauchy-Crofton; Sbert 1993).
+    Without sensors, all come from lines around the scene. Mirrors and glass get points only if
+    ``mirrors`` is set.
+    """
+    wanted = mi.BSDFFlags.Smooth
+    if mirrors:
+        wanted = wanted | mi.BSDFFlags.DeltaReflection
+    sampler = mi.load_dict({"type": "independent"})
+
+    def walks(n_rays, batch):
+        points = []
+        for index, sensor in enumerate(sensors):
+            sampler.seed(1009 * (MAX_BATCHES * seed + batch) + index + 1, n_rays)
+            points.append(_walk(scene, object_ids, sampler, sensor, n_rays, wanted, index + 1))
+        return points
+
+    points = []
+    if sensors:
+        points = _enough(walks, count // 2, WALK_HITS * len(sensors))
+        count -= count // 2
+    spheres = _spheres(scene, points)
+
+    def lines(n_rays, batch):
+        sampler.seed(1009 * (MAX_BATCHES * seed + batch), n_rays)
+        ray, within = _global_lines(spheres, sampler, n_rays)
+        return [_hits_along(scene, object_ids, sampler, ray, LINE_HITS, wanted, within=within)]
+
+    return SurfacePoints.concatenate(points + _enough(lines, count, LINE_HITS))
+
+
+def walk_from(
+    scene: mi.Scene, object_ids: ObjectIds, sensor: mi.Sensor, n_rays: int
+) -> SurfacePoints:
+    """What walks from a sensor meet, as ``scatter_points`` does it."""
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(0, n_rays)
+    return _walk(scene, object_ids, sampler, sensor, n_rays, mi.BSDFFlags.Smooth, 1)
+
+
+def _walk(scene, object_ids, sampler, sensor, n_rays, wanted, number) -> SurfacePoints:
+    ray = _sensor_rays(sensor, sampler)
+    return _hits_along(scene, object_ids, sampler, ray, WALK_HITS, wanted, walk=number)
+
+
+def _spheres(scene: mi.Scene, walks: list[SurfacePoints]) -> np.ndarray:
+    """Centres and radii [V, 4] of where the walks of each sensor have been, or of the scene.
+
+    A few that have gone far, over a plain or out of a window, don't count.
+    """
+    spheres = []
+    points = SurfacePoints.concatenate(walks) if walks else None
+    for number in np.unique(points.seen) if points else ():
+        spheres.append(_around(points.position[points.seen == number]))
+    if not spheres:
+        sphere = scene.bbox().bounding_sphere()
+        spheres.append([*sphere.center, sphere.radius])
+    return np.array(spheres, dtype=np.float32)
+
+
+def _around(position: np.ndarray) -> list[float]:
+    """Centre and radius of a sphere about most of some positions [N, 3]."""
+    some = position[:: max(len(position) // EXTENT_POINTS, 1)]
+    low, high = np.percentile(some, [2, 98], axis=0)
+    diagonal = 1.05 * (high - low)  # What is cut off where a box is filled evenly.
+    return [*(low + high) / 2, 0.5 * float(np.linalg.norm(diagonal))]
+
+
+def _enough(trace, count: int, n_hits: int) -> list[SurfacePoints]:
+    """Points of about ``count`` hits, ``n_hits`` of a ray at most.
+
+    Rays miss open scenes and leave them early: ``trace(n_rays, batch)`` goes on until there are
+    enough hits. Recording a batch costs more than tracing it, so the second is made to be the last.
+    """
+    least = max(count // n_hits, 1)
+    points, traced, n_rays = [], 0, least
+    for batch in range(MAX_BATCHES):
+        points += trace(n_rays, batch)
+        traced += n_rays
+        found = sum(map(len, points))
+        if found >= ENOUGH * count or traced >= MAX_RAYS * least:
+            break
+        missing = (count - found) * traced // max(found, 1)
+        n_rays = min(max(missing, 1), MAX_RAYS * least - traced)
+    return points
+
+
+def _sensor_rays(sensor: mi.Sensor, sampler: mi.Sampler) -> mi.Ray3f:
+    time = sensor.shutter_open() + sensor.shutter_open_time() * sampler.next_1d()
+    ray, _ = sensor.sample_ray_differential(
+        time, sampler.next_1d(), sampler.next_2d(), sampler.next_2d()
+    )
+    return mi.Ray3f(ray)
+
+
+def _global_lines(
+    spheres: np.ndarray, sampler: mi.Sampler, n_rays: int
+) -> tuple[mi.Ray3f, mi.Vector4f]:
+    """Lines of uniform measure through spheres [V, 4], equally many through each.
+
+    Returns the lines and the sphere of each.
+    """
+    lane = dr.arange(mi.UInt32, n_rays) % dr.opaque(mi.UInt32, len(spheres))
+    sphere = dr.gather(mi.Vector4f, upload(mi.Float, spheres), lane)
+    direction = mi.warp.square_to_uniform_sphere(sampler.next_2d())
+    disk = mi.warp.square_to_uniform_disk_concentric(sampler.next_2d())
+    offset = mi.Frame3f(direction).to_world(mi.Vector3f(disk.x, disk.y, -1.01))
+    return mi.Ray3f(mi.Point3f(sphere.xyz) + sphere.w * offset, direction), sphere
+
+
+@dr.syntax
+def _hits_along(
+    scene: mi.Scene,
+    object_ids: ObjectIds,
+    sampler: mi.Sampler,
+    ray: mi.Ray3f,
+    n_hits: int,
+    wanted: mi.BSDFFlags,
+    walk: int = 0,
+    within: mi.Vector4f | None = None,
+) -> SurfacePoints:
+    """Follow rays over ``n_hits`` hits, on a walk of a sensor or straight through surfaces.
+
+    Points are kept where the BSDF has any of the ``wanted`` flags, and ``within`` a sphere.
+    """
+    n_rays = dr.width(ray)
+    size = n_hits * n_rays
+    positions, normals, shading_normals = (dr.zeros(mi.Float, 3 * size) for _ in range(3))
+    object_of_point, reflects = dr.zeros(mi.UInt32, size), dr.zeros(mi.Float, size)
+    kept, turned = dr.zeros(mi.Bool, size), dr.zeros(mi.Bool, size)
+    n_hits_, n_rays_ = dr.opaque(mi.UInt32, n_hits), dr.opaque(mi.UInt32, n_rays)
+
+    ray = mi.Ray3f(ray)
+    index = dr.arange(mi.UInt32, n_rays)
+    active = dr.full(mi.Bool, True, n_rays)
+    while dr.hint(
+        active,
+        exclude=[positions, normals, shading_normals, object_of_point, kept, turned, reflects],
+        label="Scatter points",
+    ):
+        count(Ray.SURVEY, ray, active)
+        si = scene.ray_intersect(ray, active)
+        active &= si.is_valid()
+        bsdf = si.bsdf()
+        facing = dr.dot(si.n, ray.d) < 0
+        normal = dr.select(facing, si.n, -si.n)
+        shading_normal = diffuse_normal(bsdf, si, active)
+        shading_normal = dr.mulsign(shading_normal, dr.dot(shading_normal, normal))
+        keep = active & ((bsdf.flags() & int(wanted)) != 0)
+        keep &= dr.all(dr.isfinite(si.p)) & dr.all(dr.isfinite(shading_normal))
+        keep &= dr.squared_norm(normal) > 0.5
+        if dr.hint(within is not None, mode="scalar"):
+            keep &= dr.norm(si.p - mi.Point3f(within.xyz)) <= 1.01 * within.w
+        dr.scatter(positions, si.p, index, keep)
+        dr.scatter(normals, normal, index, keep)
+        dr.scatter(shading_normals, shading_normal, index, keep)
+        dr.scatter(object_of_point, object_ids(si), index, keep)
+        dr.scatter(kept, mi.Bool(True), index, keep)
+        aligned = dr.abs(dr.dot(shading_normal, si.sh_frame.n))
+        dr.scatter(turned, aligned < UNTURNED, index, keep)
+
+        direction = ray.d
+        if dr.hint(walk > 0, mode="scalar"):
+            bs, weight = bsdf.sample(
+                mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active
+            )
+            direction = si.to_world(bs.wo)
+            dr.scatter(reflects, mean_channel(weight), index, keep)
+            active &= mi.luminance(weight) > 0 if len(weight) == 3 else weight[0] > 0
+        ray = si.spawn_ray(direction)
+        index += n_rays_
+        active &= index < n_hits_ * n_rays_
+
+    dr.eval(positions, normals, shading_normals, object_of_point, kept, turned, reflects)
+    chosen = np.flatnonzero(kept.numpy())
+    position, normal, shading_normal = (
+        vectors.numpy().reshape(size, 3)[chosen]
+        for vectors in (positions, normals, shading_normals)
+    )
+    return SurfacePoints(
+        position,
+        normal,
+        shading_normal,
+        object_of_point.numpy()[chosen],
+        np.full(len(chosen), float(walk), dtype=np.float32),
+        turned.numpy()[chosen],
+        (chosen // n_rays).astype(np.uint32),
+        reflects.numpy()[chosen],
+    )

@@ -1,0 +1,111 @@
+"""Map generation: radiance and distance of what lies beyond a cluster's cube (paper section 2)."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...lookup.cube import exit_distance, face_to_direction
+from ...lookup.cube_map import Cluster, CubeMap
+from ...system.jit import upload
+from ...system.progress import stage
+from ...system.ray_counts import Ray, count
+from ..coarse_mesh.surface_points import SurfacePoints
+from .mipmap import build_levels
+
+#: Bake rays per kernel launch: bounds memory.
+MAX_LANES = 1 << 22
+#: Least inverse distance [1/m] under the sign of a masked texel.
+MASKED = 1e-15
+
+
+def bake_maps(
+    scene: mi.Scene,
+    radiance_distance,
+    clusters: list[Cluster],
+    points: list[SurfacePoints],
+    resolution: int,
+    samples: int,
+    seed: int,
+) -> tuple[CubeMap, ...]:
+    """Bake the maps of clusters, all at once.
+
+    ``radiance_distance(sampler, ray, active)`` gives radiance along rays and the distance to what
+    they hit; ``points`` are the surface points of each cluster. Rays go out from the centre but
+    start on the cube. Where a start lies behind geometry, no ray of the cluster ever leaves there:
+    such texels, recognised because no point of the cluster sees the start, are masked and filled
+    before mip-mapping. ``samples`` rays per texel, a power of two.
+    """
+    if not clusters:
+        return ()
+    n_texels = len(clusters) * 6 * resolution**2
+    centres = upload(mi.Float, np.stack([cluster.centre for cluster in clusters]))
+    half_widths = upload(mi.Float, np.array([cluster.half_width for cluster in clusters]))
+    members = SurfacePoints.concatenate(points)
+    first = upload(mi.UInt32, np.cumsum([0, *map(len, points)]))
+    resolution_ = dr.opaque(mi.UInt32, resolution)
+    n_pixels = resolution_ * resolution_
+
+    launch = max(MAX_LANES // samples, 1)
+    totals = np.empty((n_texels, len(mi.Spectrum()) + 2), np.float32)
+    with stage("Baking maps", total=n_texels) as advance:
+        for begin in range(0, n_texels, launch):
+            end = min(begin + launch, n_texels)
+            sampler = mi.load_dict({"type": "independent"})
+            sampler.seed(seed + begin, (end - begin) * samples)
+            lane = dr.arange(mi.UInt32, (end - begin) * samples)
+            index = dr.opaque(mi.UInt32, begin) + (
+                lane >> dr.opaque(mi.UInt32, int(np.log2(samples)))
+            )
+
+            # ---- Direction through the texel ----
+            face, y, x = (
+                index // n_pixels,
+                (index // resolution_) % resolution_,
+                index % resolution_,
+            )
+            cluster, face = face // 6, face % 6
+            u = mi.Point2f(mi.Float(x), mi.Float(y)) + sampler.next_2d()
+            d = dr.normalize(face_to_direction(face, 2 * u / mi.Float(resolution_) - 1))
+            centre = dr.gather(mi.Point3f, centres, cluster)
+            half_width = dr.gather(mi.Float, half_widths, cluster)
+            start = exit_distance(centre, half_width, centre, d)
+            o = centre + start * d
+
+            # ---- Can a ray from the cluster get there? ----
+            first_point = dr.gather(mi.UInt32, first, cluster)
+            n_points = dr.gather(mi.UInt32, first, cluster + 1) - first_point
+            k = dr.minimum(mi.UInt32(sampler.next_1d() * mi.Float(n_points)), n_points - 1)
+            si = members.interaction(first_point + k)
+            reached = dr.dot(o - si.p, si.n) > 0
+            ray = si.spawn_ray_to(o)
+            ray.maxt = dr.norm(o - ray.o)  # No shorter: the start may lie just behind a wall.
+            count(Ray.SURVEY, ray, reached)
+            reached &= ~scene.ray_test(ray, reached)
+
+            radiance, distance = radiance_distance(sampler, mi.Ray3f(o, d), reached)
+            value = [*radiance, dr.rcp(start + distance)]
+            value = [dr.select(reached & dr.isfinite(c), c, 0) for c in value]
+            value.append(dr.select(reached, 1.0, 0.0))
+            dr.eval(value)  # Once: each block sum would trace all rays anew.
+            total = [dr.block_sum(c, samples) for c in value]
+            dr.eval(total)
+            totals[begin:end] = np.stack([t.numpy() for t in total], axis=-1)
+            advance(end - begin)
+
+    shape = 6, resolution, resolution, totals.shape[1]
+    return tuple(
+        CubeMap(cluster, _levels(total.reshape(shape), samples))
+        for cluster, total in zip(clusters, np.split(totals, len(clusters)), strict=True)
+    )
+
+
+def _levels(total: np.ndarray, samples: int) -> list[np.ndarray]:
+    """All levels of a map from the sums [6, R, R, C + 2] over the rays that arrived, and these."""
+    weight = total[..., -1]
+    value = total[..., :-1] / np.maximum(weight, 1)[..., None]
+    levels = build_levels(value.astype(np.float64), weight / samples)
+    masked = weight == 0
+    levels[0][masked, -1] = -np.maximum(levels[0][masked, -1], MASKED)
+    return [level.astype(np.float32) for level in levels]

@@ -1,0 +1,170 @@
+"""A survey of the direct light on the patches, before anything is decided about them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...lookup.emitter_choice import Emitters, SourceChoice
+from ...lookup.patches import Patches, normal_direction
+from ...system.jit import mean_channel, upload, upload_vectors
+from ...system.ray_counts import Ray, count
+from ..coarse_mesh.build import cell_keys
+from ..coarse_mesh.patch_points import PatchPoints
+from ..coarse_mesh.surface_points import SurfacePoints
+from .alias_tables import alias_tables, by_weight
+
+#: Shadow rays per patch.
+SAMPLES = 128
+#: Part of the shadow rays that goes to emitters regardless of what has been found of them.
+UNINFORMED = 0.1
+#: Shadow rays per emitter from which on what they find of each tells emitters apart.
+RAYS_PER_EMITTER = 8
+
+
+@dataclass(frozen=True)
+class DirectLight:
+    """Samples of the irradiance from sources at surface points of K patches, N of each.
+
+    members      the patches and their surface points
+    irradiance   [K * N]  W/m², mean of the colour channels, over the probability of the emitter
+    emitter      [K * N]  index of the emitter it came from
+    position     [K * N]
+    """
+
+    members: PatchPoints
+    irradiance: mi.Float
+    emitter: mi.UInt32
+    position: mi.Point3f
+
+    def __len__(self) -> int:
+        """Number K of patches."""
+        return len(self.members.patches)
+
+
+def survey_direct_light(
+    scene: mi.Scene,
+    emitters: Emitters,
+    points: SurfacePoints,
+    patch_of_point: np.ndarray,
+    n_patches: int,
+    seed: int = 0,
+) -> DirectLight:
+    """Send ``SAMPLES`` shadow rays from random surface points of each patch."""
+    members = PatchPoints(points, patch_of_point, n_patches)
+    n = len(members.patches) * SAMPLES
+    if n == 0:
+        return DirectLight(members, mi.Float(), mi.UInt32(), mi.Point3f())
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, n)
+    point = members.sample(dr.arange(mi.UInt32, n) // SAMPLES, sampler.next_1d())
+    si = points.interaction(point)
+    choice = by_weight(emitters)
+    ds, light = sample_irradiance(scene, choice, si, mi.UInt32(0), sampler.next_2d())
+    irradiance = finite(mean_channel(light))
+    emitter = emitters.index(ds.emitter, irradiance > 0)
+    dr.eval(irradiance, emitter, si.p)
+    return DirectLight(members, irradiance, emitter, si.p)
+
+
+def choose_sources(
+    emitters: Emitters,
+    light: DirectLight,
+    points: SurfacePoints,
+    cell_of_point: np.ndarray,
+    patches: Patches,
+) -> SourceChoice:
+    """Probabilities of the emitters in each large cell, by the light found of them there.
+
+    In proportion to the root mean square: to the mean, near lamps would get too few shadow rays.
+    What doesn't shine on any patch keeps a small probability; ``sampling_weight`` scales all.
+    Cells with too few shadow rays to tell so many emitters apart share what has been found in
+    their surroundings.
+    """
+    n, weights = emitters.count, emitters.weights
+    if n < 2:
+        return by_weight(emitters)
+    emitter = light.emitter.numpy().astype(np.int64)
+    # The irradiance has been divided by the weights.
+    square = np.square(light.irradiance.numpy().astype(np.float64)) * weights[emitter]
+    if not square.any():
+        return by_weight(emitters)
+
+    # ---- Which rays left from each cell ----
+    point = light.members.index[light.members.first[:-1]]
+    in_cell = cell_of_point[point] >= 0
+    point = point[in_cell]
+    cells, first, cell = np.unique(cell_of_point[point], return_index=True, return_inverse=True)
+    n_rays = SAMPLES * np.bincount(cell, minlength=len(cells))
+    lit = square.reshape(-1, SAMPLES)[in_cell] > 0
+    cell = np.repeat(cell, lit.sum(axis=1))
+    lit_by = emitter.reshape(-1, SAMPLES)[in_cell][lit]
+    lit_square = square.reshape(-1, SAMPLES)[in_cell][lit]
+    n_lit = np.bincount(cell, minlength=len(cells))
+
+    # ---- A row for the smallest surroundings of each cell that rays enough left from ----
+    row = np.full(len(cells), -1)
+    rows, n_rows = [], 0
+    waiting = np.ones(len(cells), dtype=bool)
+    for group in _surroundings(points, point[first], patches):
+        informed = np.bincount(group, n_rays)[group] >= RAYS_PER_EMITTER * n
+        new = waiting & informed & (np.bincount(group, n_lit)[group] > 0)
+        waiting &= ~informed
+        used, place = np.unique(group[new], return_inverse=True)
+        row[new] = n_rows + place
+        rank = np.full(group.max(initial=0) + 1, -1)
+        rank[used] = np.arange(len(used))
+        there = rank[group][cell]
+        slot = (there * n + lit_by)[there >= 0]
+        found = np.bincount(slot, lit_square[there >= 0], len(used) * n)
+        rows.append(found.reshape(-1, n))
+        n_rows += len(used)
+        if not waiting.any():
+            break
+    # The last row is for the rest, and for the empty slots of the cells' hash table.
+    rows.append(np.bincount(emitter, square, n)[None])
+    row_of_cell = np.full(dr.width(patches.levels), n_rows)
+    row_of_cell[cells] = np.where(row < 0, n_rows, row)
+
+    found = np.sqrt(np.concatenate(rows))
+    found /= found.sum(axis=1, keepdims=True)
+    probability = (1 - UNINFORMED) * found + UNINFORMED * weights
+    table = upload(mi.Float, alias_tables(probability))
+    return SourceChoice(emitters, table, upload(mi.UInt32, row_of_cell))
+
+
+def _surroundings(points: SurfacePoints, index: np.ndarray, patches: Patches):
+    """Ever larger groups of cells, of which ``index`` gives a surface point of each.
+
+    First each cell is its own group; then those that face the same way in cubes of twice the edge,
+    four times … Yields the group [C] of each cell.
+    """
+    yield np.arange(len(index))
+    position = upload_vectors(mi.Point3f, points.position[index])
+    facing = normal_direction(upload_vectors(mi.Normal3f, points.normal[index]))
+    size = patches.size[0]
+    while size <= points.extent:
+        size *= 2
+        coarser = replace(patches, size=dr.opaque(mi.Float, size))
+        keys = cell_keys(coarser, position, facing, mi.UInt32(0))
+        yield np.unique(keys, return_inverse=True)[1]
+
+
+def sample_irradiance(scene, choice, si, row, u):
+    """One sample of the irradiance [W/m²] from sources at a point: ``(ds, irradiance)``."""
+    ds, weight = choice.sample_direction(si, row, u, True)
+    cosine = dr.maximum(dr.dot(si.sh_frame.n, ds.d), 0)
+    light = weight * dr.select(dr.dot(si.n, ds.d) > 0, cosine, 0)
+    active = (ds.pdf != 0) & (dr.max(light) > 0)
+    ray = si.spawn_ray_to(ds.p)
+    count(Ray.SHADOW, ray, active)
+    active &= ~scene.ray_test(ray, active)
+    return ds, dr.select(active, light, 0)
+
+
+def finite(x):
+    """Zero in place of infinities and NaN, which degenerate geometry may bring."""
+    return dr.select(dr.isfinite(x), x, 0)

@@ -1,0 +1,232 @@
+"""Gather rays of the radiosity pass: what the patches receive, and from which of them.
+
+One batch of rays per patch measures the light transport between patches once, as in ray tracing
+based radiosity (Wallace et al. 1987).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ...lookup.patches import PARTS
+from ...system.jit import mean_channel, mix, unit, upload
+from ...system.progress import stage
+from ...transport.path import PathState, Transport, follow, mis_weight
+from ..coarse_mesh.patch_points import PatchPoints
+from .direct_light import finite, sample_irradiance
+
+#: Steps of the R2 sequence (Roberts 2018).
+R2 = (0.7548776662466927, 0.5698402909980532)
+#: Gather rays per kernel launch: bounds memory.
+MAX_LANES = 1 << 22
+#: Floats that gather rays leave, and the iteration for them.
+FLOATS_PER_RAY = 16
+
+
+@dataclass(frozen=True)
+class GatherRays:
+    """What blocks of gather rays have found, ``samples`` N in each of B blocks.
+
+    rank             [B]      place in ``PatchPoints.patches`` of the patch a block belongs to
+    direct, escaped  [B]      W/m²: irradiance from sources, and π b, the indirect light that comes
+                              from no patch; means over the rays
+    of_sources, of_others [N * B]  W/m²: the same of each ray, mean of the colour channels
+    weight           [N * B]  throughput with which a ray ends in a patch,
+    row              [N * B]  ... and the row of the irradiance table that it ends in
+    start, place     [N * B]  places where it starts and where it ends (``PathEnd.place``)
+    """
+
+    rank: np.ndarray
+    direct: mi.Spectrum
+    escaped: mi.Spectrum
+    of_sources: mi.Float
+    of_others: mi.Float
+    weight: mi.Spectrum
+    row: mi.UInt32
+    start: mi.UInt32
+    place: mi.UInt32
+
+    def __len__(self) -> int:
+        """Number of blocks B."""
+        return len(self.rank)
+
+    @property
+    def samples(self) -> int:
+        """Rays N in a block."""
+        return dr.width(self.row) // max(len(self), 1)
+
+    @staticmethod
+    def concatenate(parts: list[GatherRays]) -> GatherRays:
+        if len(parts) == 1:
+            return parts[0]
+        names = (field.name for field in fields(GatherRays))
+        return GatherRays(*(_concatenate([getattr(part, n) for part in parts]) for n in names))
+
+
+class Blocks:
+    """Which blocks of gather rays stand for each of K patches.
+
+    rank    [B]  place of a block's patch, in ascending order
+    count   [K]  number of blocks
+    """
+
+    def __init__(self, rank: np.ndarray, n_patches: int):
+        self.rank = rank
+        self.count = np.bincount(rank, minlength=n_patches)
+        self._one_each = len(rank) == n_patches
+        self._first = upload(mi.UInt32, np.cumsum(self.count) - self.count)
+        self._count = upload(mi.UInt32, self.count)
+
+    def mean(self, values: mi.Spectrum) -> mi.Spectrum:
+        """Means [K] over the blocks of each patch, always summed in the same order."""
+        return values if self._one_each else self._mean(dr.ravel(values))
+
+    @dr.syntax
+    def _mean(self, values: mi.Float) -> mi.Spectrum:
+        dr.eval(values)
+        total, i = mi.Spectrum(0), mi.UInt32(0)
+        while dr.hint(i < self._count, exclude=[self, values], label="Blocks of a patch"):
+            total += dr.gather(mi.Spectrum, values, self._first + i)
+            i += 1
+        return total / mi.Float(self._count)
+
+
+def gather(
+    scene: mi.Scene,
+    transport: Transport,
+    members: PatchPoints,
+    cell_of_point: np.ndarray,
+    rank: np.ndarray,
+    samples: int,
+    seed: int,
+) -> GatherRays:
+    """Send a block of rays, ``samples`` of them, from surface points of each patch in ``rank``.
+
+    Rays start from random ones of the points, with as many shadow rays. ``samples`` must be a power
+    of two.
+    """
+    cells = upload(mi.UInt32, cell_of_point[members.index[members.first[:-1]]])
+    position, normal, object_id = members.points.places()
+    _, size, _ = transport.patches.find_cell(position, normal, object_id)
+    parts = transport.patches.part(position, size)
+    dr.eval(parts)
+    launch = max(MAX_LANES // samples, 1)
+    found = []
+    with stage("Gathering irradiance", total=len(rank)) as advance:
+        for begin in range(0, len(rank), launch):
+            some = rank[begin : begin + launch]
+            seed_ = seed + 1 + begin
+            found.append(_gather(scene, transport, members, parts, cells, some, samples, seed_))
+            advance(len(some))
+    return GatherRays.concatenate(found)
+
+
+def block_mean(value: mi.Spectrum | mi.Float, samples: int):
+    """Means over the rays of each block."""
+    if dr.depth_v(value) == 1:
+        return dr.block_sum(value, samples) / samples
+    return type(value)(*(dr.block_sum(c, samples) / samples for c in value))
+
+
+def _gather(scene, transport, members, parts, cells, rank, samples, seed) -> GatherRays:
+
+    n_lanes = len(rank) * samples
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, n_lanes)
+    lane = dr.arange(mi.UInt32, n_lanes)
+    block = lane >> dr.opaque(mi.UInt32, int(np.log2(samples)))
+    member = dr.gather(mi.UInt32, upload(mi.UInt32, rank), block)
+    k = lane & (dr.opaque(mi.UInt32, samples) - 1)
+    point = members.sample(member, sampler.next_1d())
+    si = members.points.interaction(point)
+    patch = dr.gather(mi.UInt32, upload(mi.UInt32, members.patches), member)
+    start_place = PARTS * patch + dr.gather(mi.UInt32, parts, point)
+
+    # ---- Low-discrepancy numbers, rotated at random for each block (Cranley-Patterson) ----
+    u = _rotated(
+        mi.Float(k) / dr.opaque(mi.Float, samples), mi.radical_inverse_2(k, 0), block, seed
+    )
+    v = _rotated(mi.Float(k) * R2[0], mi.Float(k) * R2[1], block, ~seed & 0xFFFFFFFF)
+
+    # ---- Direction: cosine ----
+    wo = mi.warp.square_to_cosine_hemisphere(u)
+    pdf = mi.warp.square_to_cosine_hemisphere_pdf(wo)
+    direction = si.to_world(wo)
+
+    # ---- Direct light, by shadow rays and by the gather rays that hit a source ----
+    sources = transport.sources
+    source_row = sources.row(dr.gather(mi.UInt32, cells, member), True)
+    ds, light = sample_irradiance(scene, sources, si, source_row, v)
+    cosine = dr.maximum(dr.dot(si.sh_frame.n, ds.d), 0)
+    direct = light * dr.select(ds.delta, 1, mis_weight(ds.pdf, cosine * dr.inv_pi))
+
+    start = PathState(
+        ray=si.spawn_ray(direction),
+        depth=mi.UInt32(1),
+        origin=mi.Interaction3f(si),
+        source_row=source_row,
+        pdf=pdf,
+        specular=mi.Bool(False),
+        bounded=mi.Bool(False),
+        cluster=mi.UInt32(0),
+        reach=mi.Float(dr.inf),
+    )
+    above = (dr.dot(si.n, direction) > 0) & (wo.z > 0)
+    end_ = follow(scene, transport, sampler, start, above)
+    direct += dr.pi * end_.direct
+    escaped = dr.pi * (end_.radiance - end_.direct)
+
+    def each(function, x):
+        return type(x)(*(function(component) for component in x))
+
+    # Turned normals look below the surface too. Materials drop what comes from there, so that it is
+    # dropped again where E is used: E is the mean of the rest.
+    dropped = dr.select(above | ~members.points.is_turned(point), mi.Float(0), 1)
+    kept = 1 - block_mean(dropped, samples)
+    scale = dr.repeat(dr.select(kept > 0, dr.rcp(kept), 0), samples)
+    direct, escaped, weight = (each(finite, scale * x) for x in (direct, escaped, end_.weight))
+    of_sources, of_others = mean_channel(direct), mean_channel(escaped)
+    # Block sums evaluate what they sum up: without this, each of them would trace all rays anew.
+    dr.eval(direct, escaped, of_sources, of_others, weight, end_.row, end_.place, start_place)
+    weight *= dr.repeat(_excess(weight, samples), samples)
+    direct, escaped = block_mean(direct, samples), block_mean(escaped, samples)
+    dr.eval(direct, escaped, weight)
+    return GatherRays(
+        rank, direct, escaped, of_sources, of_others, weight, end_.row, start_place, end_.place
+    )
+
+
+def _excess(weight: mi.Spectrum, samples: int) -> mi.Float:
+    """Factor [1] for the throughputs of each block, below 1 where they'd bring more than all light.
+
+    No patch receives more than what the others reflect, unless by noise: few rays met heavy weights
+    of a material. In a narrow vase, which sees itself, the solution would grow without end. Such
+    blocks get as much as all blocks do on average.
+    """
+    whole = dr.max(block_mean(weight, samples))
+    dr.eval(whole)
+    n_blocks = dr.opaque(mi.Float, dr.width(whole))
+    usual = dr.sum(dr.minimum(whole, 1)) / n_blocks
+    return dr.select(whole > 1, usual / whole, 1)
+
+
+def _rotated(x, y, block, seed) -> mi.Point2f:
+    """A point set moved round the unit square, by another shift for every block."""
+    seed_ = dr.opaque(mi.UInt32, seed)
+    bits = (mix(mix(2 * block + axis) ^ seed_) for axis in range(2))
+    shift = mi.Point2f(*map(unit, bits))
+    point = mi.Point2f(x, y) + shift
+    return point - dr.floor(point)
+
+
+def _concatenate(parts):
+    """One array of numbers or spectra in place of several."""
+    if isinstance(parts[0], np.ndarray):
+        return np.concatenate(parts)
+    if dr.depth_v(parts[0]) == 1:
+        return dr.concat(parts)
+    return type(parts[0])(*(dr.concat(components) for components in zip(*parts, strict=True)))

@@ -1,0 +1,199 @@
+"""How uncertain the irradiance cache leaves the picture, and which patches deserve more rays.
+
+Gather rays are few; what they miss makes whole walks of light too dark, and the picture doesn't
+show it: it is smooth, and wrong. An adjoint solution tells how much the picture hangs on each
+patch, after any number of bounces; with the scatter of what the patch's own rays found, it gives
+the error of the picture (a dual weighted residual; Becker and Rannacher 2001).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.sparse import csr_matrix
+
+from ...lookup.irradiance_cache import IrradianceCache
+from ...system.jit import mean_channel
+from ..coarse_mesh.patch_points import PatchPoints
+from .coarseness import Coarseness, coarseness
+from .gather import Blocks, GatherRays
+
+#: Relative standard error of the picture's brightness that is good enough: two of them are 1 %.
+TARGET = 0.005
+#: Part of the further rays that goes by what is at stake, over the part that goes by what is known.
+STAKE = 0.1
+#: Rays of a block that the adjoint solution follows at most, change at which it has converged, and
+#: bounces at most.
+ADJOINT_RAYS, CONVERGED, MAX_BOUNCES = 32, 1e-3, 64
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What the picture owes to the chance of gather rays.
+
+    chance           [1]  standard error of a picture's brightness, over that brightness: of the
+                          sensor for which it is largest
+    coarseness            what the size of the patches adds to it
+    scatter          [K]  what a single ray of each patch adds to that error, root mean square over
+                          the patch's surroundings
+    stake            [K]  share of the picture's brightness that passes through the patch, likewise
+    count            [K]  blocks of rays so far
+    escaped_share    [K]  see ``Solution``
+    """
+
+    chance: float
+    coarseness: Coarseness
+    scatter: np.ndarray
+    stake: np.ndarray
+    count: np.ndarray
+    escaped_share: np.ndarray
+
+    @property
+    def error(self) -> float:
+        """Relative error [1] of the picture's brightness, by chance and by the size of patches."""
+        return float(np.sqrt(self.chance**2 + self.coarseness.squared_error))
+
+    @property
+    def steep(self) -> np.ndarray:
+        """Large cells [C] whose patches must be smaller, lest the picture be wrong."""
+        coarse = self.coarseness
+        return coarse.steep & (abs(coarse.steep_bias) > max(TARGET, coarse.doubt))
+
+    def blocks_wanted(self, most: int, samples: int) -> np.ndarray:
+        """How many new blocks [K] of ``samples`` rays each patch should have, ``most`` in all.
+
+        As many as bring the error to ``TARGET``, each where it lowers it most: in proportion to
+        what a ray adds to the error (Neyman 1934). A few go by what is at stake, as patches whose
+        rays have all missed the light don't know what they miss. None at all if there is no
+        need.
+        """
+        total = self.scatter.sum()
+        if self.chance <= TARGET or total == 0:
+            return np.zeros(len(self.count), dtype=np.int64)
+        needed = min((total / TARGET) ** 2 / samples, most)
+        share = self.scatter / total + STAKE * self.stake / max(self.stake.sum(), 1e-30)
+        return np.maximum(np.ceil(needed * share / share.sum()), 1).astype(np.int64)
+
+
+def cache_noise(
+    rays: GatherRays,
+    blocks: Blocks,
+    cache: IrradianceCache,
+    members: PatchPoints,
+    cell_of_point: np.ndarray,
+) -> Noise:
+    """Find out how uncertain a cache is that was solved from ``blocks`` of ``rays``."""
+    samples, rank = rays.samples, blocks.rank
+    table = cache.table.numpy().reshape(-1, len(mi.Spectrum())).mean(axis=1)
+    irradiance = table[2 * members.patches]
+    views = _views(members, irradiance)
+    total, indirect = _importance(rays, blocks, cache, members, views)
+    n_cells = dr.width(cache.patches.levels)
+    of_patches = mean_channel(rays.weight * cache.irradiance(rays.row))
+    dr.eval(of_patches)
+    # What is seen first gathers by rays of its own, as if it were patches.
+    importance = (indirect + views).sum(axis=1)
+    arriving = of_patches.numpy()
+    coarse = coarseness(rays, blocks, table, arriving, importance, members, cell_of_point, n_cells)
+
+    # ---- Scatter within each block: rays k and k ^ step start in neighbouring directions ----
+    step = 1 << (samples.bit_length() - 1) // 2
+    sources, others = rays.of_sources, rays.of_others + of_patches
+    t, i = total[rank], indirect[rank]
+    block = sum(
+        importance * _block_sum(x, samples)[:, None] / samples
+        for importance, x in ((t, sources), (i, others))
+    )
+    if samples > 1:
+        lane = dr.arange(mi.UInt32, dr.width(others)) ^ dr.opaque(mi.UInt32, step)
+        dr.eval(others)
+        sources, others = (x - dr.gather(mi.Float, x, lane) for x in (sources, others))
+    products = sources * sources, others * others, 2 * sources * others
+    moments = (0.5 / samples**2 * _block_sum(x, samples)[:, None] for x in products)
+    within = sum(a * moment for a, moment in zip((t * t, i * i, t * i), moments, strict=True))
+
+    # ---- By patch: the scatter of its blocks, if there are several, as rays of one are stratified
+    count = blocks.count
+    share = 1 / count[rank]
+    by_patch = csr_matrix((share, (rank, np.arange(len(rank)))), (len(count), len(rank)))
+    between = np.square(block - (by_patch @ block)[rank])
+    several = count > 1
+    variance = by_patch @ np.where(several[rank, None], between, within)
+    variance /= np.where(several, count - 1, 1)[:, None]
+    chance = np.sqrt(variance.sum(axis=0).max())
+    variance = variance.sum(axis=1)
+
+    # ---- In its surroundings ----
+    cell = np.unique(cell_of_point[members.index[members.first[:-1]]], return_inverse=True)[1]
+
+    def around(values):
+        return (np.bincount(cell, values) / np.bincount(cell))[cell]
+
+    squares = (_block_sum(dr.square(x), samples) for x in (rays.of_others, of_patches))
+    escaped, patched = (np.bincount(rank, x * share) for x in squares)
+    return Noise(
+        chance=float(chance),
+        coarseness=coarse,
+        scatter=np.sqrt(around(variance * count * samples)),
+        stake=around(indirect.sum(axis=1) * irradiance),
+        count=count,
+        escaped_share=escaped / np.maximum(escaped + patched, 1e-30),
+    )
+
+
+def _views(members: PatchPoints, irradiance: np.ndarray) -> np.ndarray:
+    """By what part [K, S] the brightness of each sensor's picture grows with a patch's irradiance.
+
+    The part that the sensor sees of it first, by what that reflects; the pictures are those of all
+    sensors that see light. Without sensors, there is one picture of all points.
+    """
+    points, n_patches = members.points, len(members.patches)
+    rank = np.repeat(np.arange(n_patches), np.diff(members.first.astype(np.int64)))
+    seen, reflects = points.seen[members.index], points.reflects[members.index]
+    seen = np.where(points.bounce[members.index] == 0, seen, 0)
+    if not seen.any():
+        seen, reflects = np.ones(len(rank)), np.ones(len(rank))
+    views = []
+    for sensor in np.unique(seen[seen > 0]):
+        view = np.bincount(rank[seen == sensor], reflects[seen == sensor], n_patches)
+        brightness = view @ irradiance
+        if brightness > 0:
+            views.append(view / brightness)
+    return np.column_stack(views) if views else np.zeros((n_patches, 1))
+
+
+def _importance(rays, blocks, cache, members, views) -> tuple[np.ndarray, np.ndarray]:
+    """By how much each picture changes with a patch's direct and indirect irradiance [K, S].
+
+    A picture sends secondary rays of its own from what it sees first; they end where the gather
+    rays from there do. From patch to patch, importance flows against the light.
+    """
+    samples, n_patches = rays.samples, len(members.patches)
+    some = np.s_[: min(samples, ADJOINT_RAYS)]
+    weight, row = (
+        x.numpy().reshape(-1, samples)[:, some] for x in (mean_channel(rays.weight), rays.row)
+    )
+    rank = blocks.rank[:, None]
+    weight = weight / (weight.shape[1] * blocks.count[rank])
+    place = row.ravel(), np.broadcast_to(rank, row.shape).ravel()
+    flow = csr_matrix((weight.ravel(), place), (2 * cache.patches.count, n_patches))
+
+    def of_patches(importance):
+        return importance.reshape(-1, 2, views.shape[1])[members.patches].transpose(1, 0, 2)
+
+    asked = flow @ views
+    importance = asked
+    for _ in range(MAX_BOUNCES):
+        previous, importance = importance, asked + flow @ of_patches(importance).sum(axis=0)
+        if np.abs(importance - previous).sum() <= CONVERGED * importance.sum():
+            break
+    total, of_indirect = of_patches(importance)
+    return total, total + of_indirect
+
+
+def _block_sum(value: mi.Float, samples: int) -> np.ndarray:
+    dr.eval(value)
+    return dr.block_sum(value, samples).numpy().astype(np.float64)

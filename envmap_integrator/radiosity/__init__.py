@@ -1,1 +1,0 @@
-"""Stage 1: a coarse mesh of patches over every surface, and the irradiance they receive."""

@@ -1,0 +1,1 @@
+"""What the rest stands on: Dr.Jit, files, memory, signals, scenes as content."""

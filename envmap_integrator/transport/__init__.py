@@ -1,0 +1,1 @@
+"""Stage 3: light transport, traced near and looked up far."""

@@ -1,0 +1,229 @@
+"""Radiance along camera and bake rays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from ..system.jit import opaque_point
+from ..system.ray_counts import Ray, count
+from .gathered import Gathered
+from .path import (
+    PathState,
+    Transport,
+    Vertex,
+    camera_path,
+    facing,
+    follow,
+    is_delta,
+    is_diffuse,
+    is_wide,
+    sample_sources,
+    single_lobe,
+    skip_sources,
+    survival_probability,
+)
+
+#: Added to the albedo of what has gloss beside its diffuse lobe: the wide part of gloss is light
+#: that the surface reflects however dark it is.
+GLOSS_ALBEDO = 0.04
+
+
+@dataclass
+class CameraSample:
+    """What a camera ray finds.
+
+    radiance   [W/m²/sr]
+    distance   [m]  to the first hit, infinite if there is none
+    valid           whether there is one (alpha)
+    gathered        the part of the radiance that pixels may share, None if there is none at all
+    """
+
+    radiance: mi.Spectrum
+    distance: mi.Float
+    valid: mi.Bool
+    gathered: Gathered | None = None
+
+    def scaled(self, factor: mi.Spectrum | mi.Float) -> CameraSample:
+        """The same, seen with a throughput or a weight of the sensor [1]."""
+        gathered = self.gathered and self.gathered.scaled(factor)
+        return replace(self, radiance=factor * self.radiance, gathered=gathered)
+
+    def finite(self) -> CameraSample:
+        """The same, but black where it isn't finite: materials give what isn't where shading
+        normals aren't, and a single sample would spoil its pixel.
+        """
+        known = dr.all(dr.isfinite(self.radiance))
+        gathered = self.gathered and self.gathered.where(known)
+        return replace(self, radiance=dr.select(known, self.radiance, 0), gathered=gathered)
+
+
+def camera_radiance(
+    scene: mi.Scene,
+    transport: Transport,
+    sampler: mi.Sampler,
+    ray: mi.Ray3f,
+    active: mi.Bool,
+    secondary_samples: int,
+) -> CameraSample:
+    """What rays of a sensor or a texel find.
+
+    Where the cache may end a path at once (``gather_depth`` 0) there are no secondary rays.
+    """
+    if transport.gather_depth == 0:
+        end = follow(scene, transport, sampler, camera_path(ray), active)
+        return CameraSample(end.radiance, end.distance, end.valid).finite()
+    return split(scene, transport, sampler, ray, active, secondary_samples).finite()
+
+
+@dr.syntax
+def split(scene, transport, sampler, ray, active, secondary_samples):
+    """Shade the first surface that isn't a mirror or glass, and send secondary rays from it.
+
+    This vertex stands outside the loop over the others also for a single secondary ray: it needs no
+    patch and those need hardly any shadow rays, which saves a fifth of the time.
+    """
+    # ---------------------- First hit ----------------------
+
+    count(Ray.PRIMARY, ray, active)
+    pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+    if dr.hint(transport.hide_emitters, mode="scalar"):
+        pi = skip_sources(scene, ray, pi, active)
+    si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+    distance = dr.select(active & si.is_valid(), si.t, dr.inf)
+    shown = active & (not transport.hide_emitters)
+    valid = shown & (scene.environment() is not None)
+    throughput, on_mirrors = mi.Spectrum(1), mi.Spectrum(0)
+    if dr.hint(transport.far_field is None or not transport.far_field.map_mirrors, mode="scalar"):
+        mirrored = active & si.is_valid() & is_delta(si.bsdf(ray))
+        si, ray, throughput, on_mirrors, solid = follow_mirrors(scene, sampler, si, ray, mirrored)
+        shown |= solid | (mirrored & si.is_valid())
+        valid |= solid
+
+    # ---------------------- First vertex ----------------------
+
+    active &= dr.max(throughput) > 0
+    hit = active & si.is_valid()
+    bsdf = si.bsdf(ray)
+    smooth = hit & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+    cube, mapped = None, smooth
+    if dr.hint(transport.far_field is not None and transport.far_field.map_mirrors, mode="scalar"):
+        mapped = hit
+    object_id = transport.object_ids(si)
+    cell, _, found = transport.patches.find_cell(si.p, facing(si, ray), object_id, mapped)
+    if dr.hint(transport.far_field is not None, mode="scalar"):
+        cube = transport.far_field.cube(cell, si.p, found)
+    sources = transport.sources
+    source_row = sources.row(cell, found)
+    no = mi.Bool(False)
+    vertex = Vertex(si, bsdf, sources, source_row, no, no, cube, mi.Float(1))
+
+    emitted = si.emitter(scene).eval(si, active & shown)
+    n_shadow = transport.shadow_samples
+    radiance = emitted + sample_sources(
+        scene, vertex, sampler, mi.UInt32(n_shadow), n_shadow > 1, smooth
+    )
+
+    # ---------------------- Secondary rays ----------------------
+
+    if dr.hint(secondary_samples == 1, mode="scalar"):
+        u = sampler.next_1d()
+        arriving, wide, nearness, solid = secondary(scene, transport, sampler, vertex, u, hit)
+        valid |= solid
+    else:
+        i = mi.UInt32(0)
+        arriving, wide, nearness = mi.Spectrum(0), mi.Spectrum(0), mi.Float(0)
+        pending = mi.Bool(hit)
+        while dr.hint(pending, exclude=[transport, vertex], label="Secondary rays"):
+            u = (mi.Float(i) + sampler.next_1d()) / mi.Float(secondary_samples)
+            one = secondary(scene, transport, sampler, vertex, u, pending)
+            arriving += one[0]
+            wide += one[1]
+            nearness += one[2]
+            valid |= pending & one[3]
+            i += 1
+            pending &= i < secondary_samples
+        arriving /= secondary_samples
+        wide /= secondary_samples
+        nearness /= secondary_samples
+    gathered = gathering(scene, si, bsdf, wide, nearness, smooth)
+    seen = CameraSample(radiance + arriving, distance, valid, gathered).scaled(throughput)
+    return replace(seen, radiance=seen.radiance + on_mirrors)
+
+
+@dr.syntax
+def follow_mirrors(scene, sampler, si, ray, active):
+    """Follow perfect mirrors and glass to what is seen in them.
+
+    Returns an interaction, invalid where nothing is seen, the ray to it, the throughput, what the
+    mirrors and the glass themselves emit [W/m²/sr], and whether anything on the way was solid.
+    """
+    si, ray, active = mi.SurfaceInteraction3f(si), mi.Ray3f(ray), mi.Bool(active)
+    throughput, eta, bounces, solid = mi.Spectrum(1), mi.Float(1), mi.UInt32(0), mi.Bool(False)
+    emitted = mi.Spectrum(0)
+    while dr.hint(active, label="Follow mirrors"):
+        emitted += throughput * si.emitter(scene).eval(si, active)
+        bs, weight = si.bsdf(ray).sample(
+            mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active
+        )
+        solid |= active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+        throughput[active] *= weight
+        eta[active] *= bs.eta
+        bounces += 1
+        survival = survival_probability(throughput, eta, bounces)
+        survives = sampler.next_1d() < survival
+        throughput[active] *= dr.select(survives, dr.rcp(survival), 0)
+        active &= dr.max(throughput) > 0
+        ray = dr.select(active, si.spawn_ray(si.to_world(bs.wo)), ray)
+        count(Ray.UNBOUNDED, ray, active)
+        si = dr.select(active, scene.ray_intersect(ray, active), si)
+        active &= si.is_valid() & is_delta(si.bsdf(ray))
+    return si, ray, throughput, emitted, solid
+
+
+def gathering(scene, si, bsdf, radiance, nearness, active) -> Gathered:
+    """What pixels may share of the ``radiance`` that the wide lobes of a surface reflect."""
+    albedo = bsdf.eval_diffuse_reflectance(si, active)
+    albedo += dr.select(single_lobe(bsdf), 0, GLOSS_ALBEDO)
+    shared = active & is_diffuse(bsdf) & (dr.max(albedo) > 0)
+    centre = opaque_point(scene.bbox().center())
+    found = Gathered(radiance, albedo, si.sh_frame.n, si.p - centre, nearness, mi.Float(1))
+    return found.where(shared)
+
+
+def secondary(scene, transport, sampler, vertex, u, active):
+    """One secondary ray.
+
+    Returns the radiance [W/m²/sr] that it brings, the part of it by wide lobes, the inverse
+    distance [1/m] to where they were traced, and whether anything was solid.
+    """
+    si = vertex.si
+    bs, weight = vertex.bsdf.sample(mi.BSDFContext(), si, u, sampler.next_2d(), active)
+    specular = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+    wide = is_wide(si, bs.wo, bs.pdf) & ~specular
+    start = PathState(
+        ray=si.spawn_ray(si.to_world(bs.wo)),
+        depth=dr.select(specular, mi.UInt32(0), mi.UInt32(1)),
+        origin=mi.Interaction3f(si),
+        source_row=vertex.source_row,
+        pdf=bs.pdf,
+        specular=specular,
+        bounded=mi.Bool(False),
+        cluster=mi.UInt32(0),
+        reach=mi.Float(dr.inf),
+        solid=active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null),
+    )
+    if vertex.cube is not None:
+        start.cluster = vertex.cube.cluster
+        start.bounded, start.ray.maxt, start.reach = transport.far_field.bound(
+            vertex.cube, start.ray, wide, sampler.next_1d(), active
+        )
+    end = follow(scene, transport, sampler, start, active & (dr.max(weight) > 0))
+    arriving = weight * end.radiance
+    if transport.clamp is not None:
+        largest = dr.max(dr.abs(arriving))
+        arriving *= dr.select(largest > transport.clamp, transport.clamp / largest, 1)
+    nearness = dr.rcp(dr.minimum(end.distance, start.ray.maxt))
+    return arriving, dr.select(wide, arriving, 0), dr.select(wide, nearness, 0), end.valid

@@ -1,0 +1,69 @@
+"""What a surface seen by the camera gathers, which pixels may share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+
+@dataclass
+class Gathered:
+    """Indirect light that a surface seen by the camera has gathered, or sums of that.
+
+    radiance   [W/m²/sr]  what its wide lobes reflect
+    albedo     [1]        what that is in proportion to, while irradiance is the same
+    normal     [3]        shading normal
+    position   [3]        relative to a point near the scene, world units
+    nearness   [1/m]      inverse distance of what the secondary ray hit
+    weight     [1]        1 if there is such a surface, else all are zero
+    """
+
+    radiance: mi.Spectrum
+    albedo: mi.Spectrum
+    normal: mi.Vector3f
+    position: mi.Vector3f
+    nearness: mi.Float
+    weight: mi.Float
+
+    CHANNELS = ("radiance", "albedo", "normal", "position", "nearness", "weight")
+
+    def channels(self) -> list[mi.Float]:
+        """All numbers of it, in a fixed order."""
+        values = []
+        for name in self.CHANNELS:
+            value = getattr(self, name)
+            values += [value] if dr.depth_v(value) == 1 else [*value]
+        return values
+
+    def scaled(self, factor: mi.Spectrum | mi.Float) -> Gathered:
+        """The same, seen with a throughput or a weight of the sensor [1]."""
+        return replace(self, radiance=factor * self.radiance, albedo=factor * self.albedo)
+
+    def where(self, mask: mi.Bool) -> Gathered:
+        """The same where ``mask`` is set, and no surface elsewhere."""
+        values = (dr.select(mask, getattr(self, name), 0) for name in self.CHANNELS)
+        return Gathered(*values)
+
+    @classmethod
+    def count(cls) -> int:
+        """Number of channels."""
+        return 2 * len(mi.Spectrum()) + 8
+
+    @classmethod
+    def of_channels(cls, channels: list[mi.Float]) -> Gathered:
+        """Inverse of ``channels``."""
+        values = iter(channels)
+
+        def take(kind):
+            return kind(*(next(values) for _ in range(len(kind()))))
+
+        return cls(
+            radiance=take(mi.Spectrum),
+            albedo=take(mi.Spectrum),
+            normal=take(mi.Vector3f),
+            position=take(mi.Vector3f),
+            nearness=next(values),
+            weight=next(values),
+        )
