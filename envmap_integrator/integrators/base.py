@@ -10,7 +10,7 @@ import mitsuba as mi
 from ..imaging.film import INDIRECT_AOVS, expose, expose_gathered, most_samples, n_pixels_of, rgb
 from ..lookup.emitter_choice import Emitters, SourceChoice
 from ..lookup.ids import ObjectIds
-from ..preparation.baked_state import Prepared, Settings, load
+from ..preparation.baked_state import BakedState, Settings, StateKey, load
 from ..preparation.coarse_mesh.views import service, view_name
 from ..preparation.pipeline import prepare
 from ..system.checks import check_not_frozen, check_scene, check_variant
@@ -79,8 +79,8 @@ class CachedIntegrator(mi.SamplingIntegrator):
         self.sampler = parameters.choice("sampler", "coherent", SAMPLERS)
         self.cache_file = parameters.text("cache_file")
         self._fingerprint = SceneFingerprint()
-        self._made_for = ("", "")
-        self._prepared: dict[tuple[Settings, str], Prepared] = {}
+        self._made_for: tuple[StateKey, str] | None = None
+        self._prepared: dict[tuple[Settings, str], BakedState] = {}
         self._objects: SceneObjects | None = None
         self._seed = 0
 
@@ -90,13 +90,9 @@ class CachedIntegrator(mi.SamplingIntegrator):
         """What the pre-passes depend on besides the scene."""
         return Settings(self.patches, self.patch_samples, self.LEAST_PATCH_SAMPLES, **more)
 
-    def transport(self, scene: mi.Scene, prepared: Prepared, spp: int) -> Transport:
+    def transport(self, scene: mi.Scene, prepared: BakedState, spp: int) -> Transport:
         """How paths are followed; ``spp`` samples share a pixel."""
         raise NotImplementedError
-
-    def bake_with(self):
-        """The integrator that bakes maps, if any."""
-        return None
 
     def to_string(self):
         parameters = {
@@ -111,7 +107,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
 
     def prepare(
         self, scene: mi.Scene, sensor: mi.Sensor | int | None = None, spp: int = 0
-    ) -> Prepared:
+    ) -> BakedState:
         """Run the pre-passes for a render of a sensor, unless they have been run.
 
         They are made for all sensors of the scene, and for the given one if it isn't the scene's;
@@ -125,7 +121,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
         """
         check_not_frozen(self.owner)
         settings = self.settings()
-        key = f"{self._fingerprint(scene)} {settings}"
+        key = StateKey(self._fingerprint(scene), settings)
         if (key, self.cache_file) != self._made_for:
             check_scene(scene, self.owner)
             self._made_for, self._prepared = (key, self.cache_file), {}
@@ -154,31 +150,33 @@ class CachedIntegrator(mi.SamplingIntegrator):
             self._keep(settings, name, state)
         return self._prepared[settings, name]
 
-    def _keep(self, settings: Settings, view: str, state: Prepared) -> None:
+    def _keep(self, settings: Settings, view: str, state: BakedState) -> None:
         """Remember which state serves a view, and forget the oldest of many states."""
         self._prepared[settings, view] = state
         states = list({id(state): state for state in self._prepared.values()}.values())
         for old in states[:-MOST_STATES]:
             self._prepared = {k: s for k, s in self._prepared.items() if s is not old}
 
-    def _that_serves(self, scene, settings: Settings, view: mi.Sensor | None) -> Prepared | None:
+    def _that_serves(self, scene, settings: Settings, view: mi.Sensor | None) -> BakedState | None:
         """What has been prepared for other views, if it serves this one too."""
         states = {id(s): s for (its, _), s in self._prepared.items() if its == settings}
         return next((s for s in states.values() if self._serves(s, scene, view)), None)
 
-    def _serves(self, state: Prepared, scene: mi.Scene, view: mi.Sensor | None) -> bool:
+    def _serves(self, state: BakedState, scene: mi.Scene, view: mi.Sensor | None) -> bool:
         if view is None or view_name(view) in state.views:
             return True
         with dr.suspend_grad():
             found = service(scene, self.objects_of(scene).ids, state.cache.patches, view)
         return found.suffices(state.service)
 
-    def _make(self, scene, key: str, settings: Settings, sensors: list[mi.Sensor]) -> Prepared:
+    def _make(
+        self, scene, key: StateKey, settings: Settings, sensors: list[mi.Sensor]
+    ) -> BakedState:
         if self.cache_file:
             state = load(self.cache_file, key, self.owner, len(scene.emitters()))
         else:
             with interruptible(), dr.suspend_grad():
-                state = prepare(scene, key, settings, sensors, self.owner, self.bake_with())
+                state = prepare(scene, key, settings, sensors, self.owner)
         if state.relative_error > DOUBTFUL:
             mi.Log(
                 mi.LogLevel.Warn,
@@ -195,7 +193,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
             self._objects = SceneObjects(content, ObjectIds(scene), Emitters(scene))
         return self._objects
 
-    def transport_from(self, scene: mi.Scene, prepared: Prepared, **more) -> Transport:
+    def transport_from(self, scene: mi.Scene, prepared: BakedState, **more) -> Transport:
         """A ``Transport`` with all that is the same for all integrators."""
         objects = self.objects_of(scene)
         return Transport(

@@ -5,9 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..lookup.cube_map import CubeMap
-from ..preparation.maps.bake import bake_maps
 from ..system.parameters import Parameters
+from ..transport.path import as_baked
 from .base import CachedIntegrator
 
 
@@ -61,30 +60,10 @@ class EnvmapBake(CachedIntegrator):
         self.samples = Parameters(props).power_of_two("samples", 8, 1, 1 << 12)
 
     def transport(self, scene, prepared, spp):
-        return self.transport_from(
-            scene,
-            prepared,
-            gather_depth=0,
-            emission=False,
-        )
+        return as_baked(self.transport_from(scene, prepared), self.shadow_samples)
 
     def aov_names(self):
         return ["distance"]
 
     def aovs(self, found):
         return [dr.select(found.valid, found.distance, 0)]
-
-    def bake(self, scene, prepared, clusters, points, resolution) -> tuple[CubeMap, ...]:
-        """Bake the maps of clusters whose surface points are ``points``, one record each.
-
-        ``prepared`` needs no more than the irradiance cache.
-        """
-        transport = self.transport(scene, prepared, self.samples)
-
-        def radiance_distance(sampler, ray, active):
-            found = self.radiance(scene, transport, sampler, ray, active)
-            return found.radiance, found.distance
-
-        return bake_maps(
-            scene, radiance_distance, clusters, points, resolution, self.samples, seed=1
-        )

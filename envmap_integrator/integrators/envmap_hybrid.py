@@ -156,14 +156,12 @@ class EnvmapHybrid(GatheringIntegrator):
             maps=True,
             map_resolution=self.map_resolution,
             map_samples=self.baker.samples,
+            map_shadow_samples=self.baker.shadow_samples,
             distance_ratio=self.distance_ratio,
             map_mirrors=self.mirrors == "map",
             map_always=self.maps == "always" or self.mirrors == "map",
             requests=self.requests,
         )
-
-    def bake_with(self):
-        return self.baker
 
     def transport(self, scene, prepared, spp):
         return self.transport_from(

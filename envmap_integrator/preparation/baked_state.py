@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -43,6 +45,7 @@ class Settings:
     maps: bool = False
     map_resolution: int = 0
     map_samples: int = 0
+    map_shadow_samples: int = 1
     distance_ratio: float = 0.0
     map_mirrors: bool = False
     map_always: bool = False
@@ -70,10 +73,33 @@ class Settings:
 
 
 @dataclass(frozen=True)
-class Prepared:
+class StateKey:
+    """What a baked state belongs to.
+
+    scene      fingerprint of the scene's content
+    settings   what was asked for, before the size of a render has decided
+    """
+
+    scene: str
+    settings: Settings
+
+    def refuses(self, scene: str, settings: dict[str, Any]) -> str:
+        """How the key of a stored state, as plain values, differs; nothing if it's the same."""
+        if scene != self.scene:
+            differing = difference(scene, self.scene)
+            return "made for another scene" + (f": it has other {differing}" if differing else "")
+        for name, ours in _plain(self.settings).items():
+            theirs = settings.get(name)
+            if theirs != ours:
+                return f"made with {name}={theirs!r}, not {name}={ours!r}"
+        return ""
+
+
+@dataclass(frozen=True)
+class BakedState:
     """The baked state of a scene, for all views of what some sensors see.
 
-    key                content hash of the scene, and the settings
+    key                what it belongs to
     cache              irradiance on the patches
     sources            [R * L * 4]  probabilities of the emitters (``SourceChoice.table``),
     source_rows        [C]          ... and which row is each large cell's
@@ -86,7 +112,7 @@ class Prepared:
     stage_times        seconds spent in each stage
     """
 
-    key: str
+    key: StateKey
     cache: IrradianceCache
     sources: mi.Float
     source_rows: mi.UInt32
@@ -108,7 +134,7 @@ class Prepared:
 _WIDTH = 1024
 
 
-def save(path, prepared: Prepared) -> None:
+def save(path, prepared: BakedState) -> None:
     """Write a prepared state to an OpenEXR file."""
     patches = prepared.cache.patches
     parts = {
@@ -126,7 +152,8 @@ def save(path, prepared: Prepared) -> None:
         parts |= map_parts
         maps.append(map_metadata)
     metadata = {
-        "key": prepared.key,
+        "scene": prepared.key.scene,
+        "asked": [_plain(prepared.key.settings)],
         "origin": [float(c[0]) for c in patches.origin],
         "size": float(patches.size[0]),
         "levels": dr.width(patches.levels),
@@ -144,7 +171,7 @@ def save(path, prepared: Prepared) -> None:
     write(path, parts, metadata)
 
 
-def load(path, key: str, owner: str, n_emitters: int) -> Prepared:
+def load(path, key: StateKey, owner: str, n_emitters: int) -> BakedState:
     """Read a prepared state; ``ValueError`` if the file holds none that belongs to ``key``.
 
     ``n_emitters`` is the number of emitters of the scene.
@@ -156,8 +183,9 @@ def load(path, key: str, owner: str, n_emitters: int) -> Prepared:
         raise ValueError(f'{owner}: "cache_file" {error}') from None
 
 
-def _prepared(stored: Stored, key: str, n_emitters: int) -> Prepared:
-    difference = _difference(stored.text("key"), key)
+def _prepared(stored: Stored, key: StateKey, n_emitters: int) -> BakedState:
+    (asked,) = stored.entries("asked")
+    difference = key.refuses(stored.text("scene"), asked.metadata)
     if difference:
         raise stored.refusal(difference)
 
@@ -199,8 +227,8 @@ def _prepared(stored: Stored, key: str, n_emitters: int) -> Prepared:
         membership = values("cluster_of_cell", "cluster", np.uint32, n_cells)
         if membership.max() > len(maps):
             raise stored.refusal(f"its clusters are more than its {len(maps)} maps")
-    return Prepared(
-        stored.text("key"),
+    return BakedState(
+        key,
         IrradianceCache(patches, upload(mi.Float, table)),
         upload(mi.Float, sources),
         upload(mi.UInt32, rows),
@@ -213,22 +241,9 @@ def _prepared(stored: Stored, key: str, n_emitters: int) -> Prepared:
     )
 
 
-def _difference(theirs: str, ours: str) -> str:
-    """What tells the key of a state (``Prepared.key``) from ours, in words; nothing if they agree.
-
-    A key is a scene's hash and the text of ``Settings``.
-    """
-    if theirs == ours:
-        return ""
-    (scene, settings), (our_scene, our_settings) = (k.partition(" ")[::2] for k in (theirs, ours))
-    if scene != our_scene:
-        differing = difference(scene, our_scene)
-        return "made for another scene" + (f": it has other {differing}" if differing else "")
-    last = len(fields(Settings)) - 1
-    each = (text.split(", ", last) for text in (settings, our_settings))
-    pairs = ((a, b) for a, b in zip(*each, strict=False) if a != b)
-    a, b = (text.removeprefix("Settings(") for text in next(pairs, (settings, our_settings)))
-    return f"made with {a}, not {b}"
+def _plain(settings: Settings) -> dict[str, Any]:
+    """Settings as JSON gives them back."""
+    return json.loads(json.dumps(asdict(settings)))
 
 
 def _image(values: np.ndarray) -> np.ndarray:

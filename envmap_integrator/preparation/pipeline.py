@@ -10,16 +10,19 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..lookup.cube_map import CubeMap
 from ..lookup.emitter_choice import Emitters
 from ..lookup.ids import ObjectIds
 from ..system.memory import check_memory
-from ..transport.path import Transport
-from .baked_state import Prepared, Settings
-from .coarse_mesh.build import build_patches
+from ..transport.camera import camera_radiance
+from ..transport.path import Transport, as_baked
+from .baked_state import BakedState, Settings, StateKey
+from .coarse_mesh.build import build_mesh
 from .coarse_mesh.patch_points import only_standing
 from .coarse_mesh.spaces import find_spaces, separate
 from .coarse_mesh.surface_points import scatter_points
 from .coarse_mesh.views import usual_service, view_name
+from .maps.bake import bake_maps
 from .maps.clusters import cluster_of_cell, find_clusters, listed_clusters, worthwhile
 from .radiosity.direct_light import choose_sources, survey_direct_light
 from .radiosity.evenness import sort_out_uneven
@@ -35,17 +38,12 @@ PATCH_MEMORY, RAY_MEMORY, TEXEL_MEMORY = 10000, 40, 130
 
 
 def prepare(
-    scene: mi.Scene,
-    key: str,
-    settings: Settings,
-    sensors: list[mi.Sensor],
-    owner: str,
-    baker=None,
-) -> Prepared:
+    scene: mi.Scene, key: StateKey, settings: Settings, sensors: list[mi.Sensor], owner: str
+) -> BakedState:
     """Run the pre-passes for the views of some sensors.
 
-    ``settings`` are those ``for_render``; ``baker`` is the ``envmap_bake`` that fills the maps.
-    Raises ``ValueError``, in the name of ``owner``, if there is too little memory for the settings.
+    ``settings`` are those of the key ``for_render``. Raises ``ValueError``, in the name of
+    ``owner``, if there is too little memory for them.
     """
     check_memory(
         owner,
@@ -64,27 +62,20 @@ def prepare(
     divided = None
     for divisions in range(MOST_DIVISIONS + 1):
         with _timed(times, "coarse mesh"):
-            patches, patch_of_point, cell_of_point = build_patches(
-                points, object_ids, settings.patches, divided
-            )
-            patch_of_point = only_standing(points, patches, patch_of_point)
-            space = find_spaces(scene, points, patch_of_point)
-            patches, patch_of_point, cell_of_point = separate(
-                scene, object_ids, patches, points, patch_of_point, cell_of_point, space
-            )
+            mesh = only_standing(build_mesh(points, object_ids, settings.patches, divided))
+            mesh = separate(scene, object_ids, find_spaces(scene, mesh))
 
         with _timed(times, "direct light"):
-            light = survey_direct_light(scene, emitters, points, patch_of_point, patches.count)
-            sources = choose_sources(emitters, light, points, cell_of_point, patches)
-            patches, patch_of_point = sort_out_uneven(light, patches, patch_of_point)
+            light = survey_direct_light(scene, emitters, mesh)
+            sources = choose_sources(emitters, light, mesh)
+            mesh = sort_out_uneven(light, mesh)
 
         with _timed(times, "irradiance cache"):
+            transport = Transport(mesh.patches, object_ids, sources)
             solution = solve_irradiance(
                 scene,
-                Transport(patches, object_ids, sources),
-                points,
-                patch_of_point,
-                cell_of_point,
+                transport,
+                mesh,
                 settings.patch_samples,
                 settings.more_rays,
                 may_divide=divisions < MOST_DIVISIONS,
@@ -93,32 +84,46 @@ def prepare(
             break
         divided = solution.steep.astype(int) + (0 if divided is None else divided)
 
-    prepared = Prepared(
+    maps, membership = (), None
+    if settings.maps:
+        with _timed(times, "clusters"):
+            clusters, cluster_of_point = _clusters(scene, mesh, solution, settings)
+            membership = cluster_of_cell(len(clusters), cluster_of_point, mesh)
+        with _timed(times, "maps"):
+            members = [points.take(cluster_of_point == i) for i in range(len(clusters))]
+            cached = replace(transport, cache=solution.cache)
+            maps = _baked(scene, cached, clusters, members, settings, owner)
+    return BakedState(
         key,
         solution.cache,
         sources.table,
         sources.row_of_cell,
         tuple(map(view_name, sensors)),
-        usual_service(points, patch_of_point),
+        usual_service(mesh),
         solution.relative_error,
-        stage_times=times,
+        maps,
+        membership,
+        times,
     )
-    if not settings.maps:
-        return prepared
 
-    with _timed(times, "clusters"):
-        if settings.requests:
-            clusters, cluster_of_point = listed_clusters(
-                points, space, scene, settings.requests, settings.distance_ratio
-            )
-        else:
-            share = solution.escaped_share[patch_of_point]
-            share = np.where(patch_of_point >= 0, share, 0)
-            clusters, cluster_of_point = _paying_clusters(points, space, settings, share)
-        membership = cluster_of_cell(
-            len(clusters), cluster_of_point, cell_of_point, dr.width(patches.levels)
-        )
 
+def _clusters(scene, mesh, solution, settings):
+    """Those that are listed, or those found whose maps would pay: see ``find_clusters``."""
+    points, space = mesh.points, mesh.space_of_point
+    if settings.requests:
+        return listed_clusters(points, space, scene, settings.requests, settings.distance_ratio)
+    share = np.where(mesh.patch_of_point >= 0, solution.escaped_share[mesh.patch_of_point], 0)
+    none = [], np.full(len(points), -1)
+    # Clusters are only looked for if they would pay at least if everything belonged to one.
+    if not (settings.map_always or worthwhile(points, share)):
+        return none
+    found = find_clusters(points, space, settings.distance_ratio)
+    if not (settings.map_always or worthwhile(points, share, found[1] >= 0)):
+        return none
+    return found
+
+
+def _baked(scene, transport, clusters, members, settings, owner) -> tuple[CubeMap, ...]:
     resolution = settings.map_resolution
     check_memory(
         owner,
@@ -126,22 +131,15 @@ def prepare(
         len(clusters) * 6 * resolution**2 * TEXEL_MEMORY,
         'lower "map_resolution" or list fewer clusters',
     )
-    with _timed(times, "maps"):
-        members = [points.take(np.flatnonzero(cluster_of_point == i)) for i in range(len(clusters))]
-        maps = baker.bake(scene, prepared, clusters, members, resolution)
-    return replace(prepared, maps=maps, cluster_of_cell=membership)
+    seen = as_baked(transport, settings.map_shadow_samples)
 
+    def radiance_distance(sampler, ray, active):
+        found = camera_radiance(scene, seen, sampler, ray, active, secondary_samples=0)
+        return found.radiance, found.distance
 
-def _paying_clusters(points, space, settings, escaped_share):
-    """As ``find_clusters``; none if their maps wouldn't pay."""
-    none = [], np.full(len(points), -1)
-    # Clusters are only looked for if they would pay at least if everything belonged to one.
-    if not (settings.map_always or worthwhile(points, escaped_share)):
-        return none
-    found = find_clusters(points, space, settings.distance_ratio)
-    if not (settings.map_always or worthwhile(points, escaped_share, found[1] >= 0)):
-        return none
-    return found
+    return bake_maps(
+        scene, radiance_distance, clusters, members, resolution, settings.map_samples, seed=1
+    )
 
 
 @contextmanager

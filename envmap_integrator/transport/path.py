@@ -102,6 +102,11 @@ class Transport:
         return replace(self, residual=residual)
 
 
+def as_baked(transport: Transport, shadow_samples: int) -> Transport:
+    """What maps hold (paper section 2): paths end in the cache at once, and sources aren't seen."""
+    return replace(transport, gather_depth=0, emission=False, shadow_samples=shadow_samples)
+
+
 @dataclass
 class PathState:
     """Where a path starts.

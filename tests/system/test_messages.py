@@ -174,7 +174,7 @@ def with_bytes(change: Callable[[bytes], bytes]) -> Callable[[Surroundings], Pat
 
 def forged(content: bytes) -> bytes:
     """Metadata that aren't JSON, with the right digest."""
-    kept = content.replace(b'"key":', b'"key";')[: -storage._DIGEST_SIZE]
+    kept = content.replace(b'"scene":', b'"scene";')[: -storage._DIGEST_SIZE]
     return kept + storage._digest(kept)
 
 
@@ -383,7 +383,7 @@ CASES = {
     "other views": Case(
         seen_from_elsewhere, '"cache_file" {folder}/state.exr', "other views", AGAIN
     ),
-    "another scene": Case(use(altered(setting("key", "a b"))), STATE, "another scene", AGAIN),
+    "another scene": Case(use(altered(setting("scene", "a"))), STATE, "another scene", AGAIN),
     "sources": Case(
         use(altered(wrong_rows)), STATE, "rows for 1 emitters", AGAIN
     ),

@@ -10,8 +10,7 @@ import numpy as np
 from envmap_integrator.lookup.emitter_choice import Emitters
 from envmap_integrator.lookup.ids import ObjectIds
 from envmap_integrator.lookup.irradiance_cache import IrradianceCache
-from envmap_integrator.lookup.patches import Patches
-from envmap_integrator.preparation.coarse_mesh.build import build_patches
+from envmap_integrator.preparation.coarse_mesh import build
 from envmap_integrator.preparation.coarse_mesh.surface_points import SurfacePoints, scatter_points
 from envmap_integrator.preparation.radiosity.alias_tables import by_weight
 from envmap_integrator.preparation.radiosity.irradiance import Solution, solve_irradiance
@@ -41,15 +40,11 @@ def scene_of(*shapes, **others) -> mi.Scene:
 
 
 @dataclass(frozen=True)
-class CoarseMesh:
+class CoarseMesh(build.CoarseMesh):
     """The coarse mesh of a scene and what it was built from."""
 
     scene: mi.Scene
     object_ids: ObjectIds
-    points: SurfacePoints
-    patches: Patches
-    patch_of_point: np.ndarray
-    cell_of_point: np.ndarray
 
     @property
     def n_used(self) -> int:
@@ -73,9 +68,7 @@ class CoarseMesh:
 
     def solution(self, samples: int) -> Solution:
         transport = Transport(self.patches, self.object_ids, by_weight(Emitters(self.scene)))
-        return solve_irradiance(
-            self.scene, transport, self.points, self.patch_of_point, self.cell_of_point, samples
-        )
+        return solve_irradiance(self.scene, transport, self, samples)
 
 
 def coarse_mesh(scene: mi.Scene, budget: int = 1024, points_per_patch: int = 128) -> CoarseMesh:
@@ -85,8 +78,8 @@ def coarse_mesh(scene: mi.Scene, budget: int = 1024, points_per_patch: int = 128
 
 def coarse_mesh_over(scene: mi.Scene, points: SurfacePoints, budget: int) -> CoarseMesh:
     object_ids = ObjectIds(scene)
-    patches, patch_of_point, cell_of_point = build_patches(points, object_ids, budget)
-    return CoarseMesh(scene, object_ids, points, patches, patch_of_point, cell_of_point)
+    built = build.build_mesh(points, object_ids, budget)
+    return CoarseMesh(**vars(built), scene=scene, object_ids=object_ids)
 
 
 def surface_points(position: np.ndarray, normal, object_id=0, seen=1.0) -> SurfacePoints:

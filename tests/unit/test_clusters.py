@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -210,4 +212,6 @@ def test_cells_take_the_cluster_of_most_of_their_points():
     """
     cluster_of_point = np.array([0, 1, 1, 0, 0, -1, -1, -1, 0, 1])
     cell_of_point = np.array([0, 0, 0, 1, 1, 2, 3, 3, 3, -1])
-    assert cluster_of_cell(2, cluster_of_point, cell_of_point, 5).tolist() == [1, 0, 2, 2, 2]
+    patches = SimpleNamespace(levels=mi.UInt32([1] * 5))
+    mesh = SimpleNamespace(patches=patches, cell_of_point=cell_of_point)
+    assert cluster_of_cell(2, cluster_of_point, mesh).tolist() == [1, 0, 2, 2, 2]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from envmap_integrator.preparation.coarse_mesh.build import build_patches
+from envmap_integrator.preparation.coarse_mesh.build import build_mesh
 from tests.helpers import load, room
 from tests.unit.kit import coarse_mesh
 from tests.unit.test_noise import behind_a_wall, solutions
@@ -39,11 +39,10 @@ def test_steep_cells_are_divided_and_no_others():
     chosen = np.flatnonzero(levels)[::7]
     divided = np.zeros(len(levels), dtype=int)
     divided[chosen] = 1
-    finer, patch_of_point, cell_of_point = build_patches(
-        coarse.points, coarse.object_ids, 1024, divided
-    )
+    finer = build_mesh(coarse.points, coarse.object_ids, 1024, divided)
+    patch_of_point, cell_of_point = finer.patch_of_point, finer.cell_of_point
     assert np.array_equal(cell_of_point, coarse.cell_of_point)
-    change = finer.levels.numpy().astype(int) - levels
+    change = finer.patches.levels.numpy().astype(int) - levels
     assert np.array_equal(change, divided)
     inside = divided[cell_of_point] == 1
     assert len(np.unique(patch_of_point[inside])) > 2.5 * len(

@@ -6,6 +6,7 @@ Those of ``mipmap_cube`` are in ``test_mipmap_cube``.
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -127,21 +128,19 @@ def gathered(monkeypatch):
         row = dr.zeros(mi.UInt32, dr.width(start.ray))
         return transport.PathEnd(black, black, black, row, row, mi.Bool(False), mi.Float(dr.inf))
 
-    monkeypatch.setattr(transport, "follow", follow)
+    monkeypatch.setattr(gather, "follow", follow)
     turned = mi.ScalarTransform4f().look_at([0, 0, 0], NORMAL.tolist(), [0, 0, 1])
     plate = {"type": "rectangle", "to_world": turned} | grey(0.5)
     coarse = coarse_mesh(scene_of(plate), budget=4096, points_per_patch=32)
     upper = coarse.points.normal @ NORMAL > 0
-    patch_of_point = np.where(upper, coarse.patch_of_point, -1)
+    coarse = replace(coarse, patch_of_point=np.where(upper, coarse.patch_of_point, -1))
     sources = by_weight(Emitters(coarse.scene))
     tools = transport.Transport(coarse.patches, coarse.object_ids, sources)
     for seed in range(16):
         irradiance.solve_irradiance(
             coarse.scene,
             tools,
-            coarse.points,
-            patch_of_point,
-            coarse.cell_of_point,
+            coarse,
             SAMPLES,
             seed=seed << 16,
         )

@@ -131,7 +131,7 @@ def test_a_sheet_under_a_point_light():
     light = received(coarse, samples)
     assert not light.indirect.any()
 
-    members = PatchPoints(coarse.points, coarse.patch_of_point, coarse.patches.count)
+    members = PatchPoints(coarse)
     n_patches, n_draws = len(members.patches), 4096
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(1, n_patches * n_draws)

@@ -47,9 +47,9 @@ def solutions(scene: mi.Scene, more_rays: int = 0, count: int = 16, budget=BUDGE
     """
     coarse = coarse_mesh(scene, budget, points_per_patch=32)
     transport = Transport(coarse.patches, coarse.object_ids, by_weight(Emitters(scene)))
-    members = PatchPoints(coarse.points, coarse.patch_of_point, coarse.patches.count)
+    members = PatchPoints(coarse)
     patches = np.arange(len(members.patches))
-    rays = gather(scene, transport, members, coarse.cell_of_point, patches, 1024, seed=7)
+    rays = gather(scene, transport, members, patches, 1024, seed=7)
     seen = (coarse.points.seen > 0) & (coarse.points.bounce == 0) & (coarse.patch_of_point >= 0)
     share = np.bincount(coarse.patch_of_point[seen], minlength=coarse.patches.count)
     share = share[members.patches] / share.sum()
@@ -60,9 +60,7 @@ def solutions(scene: mi.Scene, more_rays: int = 0, count: int = 16, budget=BUDGE
         solution = solve_irradiance(
             scene,
             transport,
-            coarse.points,
-            coarse.patch_of_point,
-            coarse.cell_of_point,
+            coarse,
             samples,
             more_rays,
             seed=1 << 20 | seed << 12,

@@ -64,10 +64,7 @@ def choice(hall) -> SourceChoice:
 
 def choice_in(hall) -> SourceChoice:
     emitters = Emitters(hall.scene)
-    light = survey_direct_light(
-        hall.scene, emitters, hall.points, hall.patch_of_point, hall.patches.count
-    )
-    return choose_sources(emitters, light, hall.points, hall.cell_of_point, hall.patches)
+    return choose_sources(emitters, survey_direct_light(hall.scene, emitters, hall), hall)
 
 
 def on_the_floor(hall, x: float | mi.Float, n: int = 1):

@@ -21,10 +21,7 @@ WALL = 0.1
 
 
 def rooms(*places: float, gap: float = 0.0, contents=()):
-    """A room 4 wide, divided by a wall with a gap at one end, with sensors at the given x.
-
-    Returns its coarse mesh and the space of each surface point.
-    """
+    """The mesh of a room 4 wide, a wall with a gap at one end in it, sensors at the given x."""
     wall = at(WALL, 2 * gap, 0).rotate([0, 1, 0], 90).scale([2.1, 2.1, 1])
     shapes = [box(2.0), {"type": "rectangle", "to_world": wall}, *contents]
     sensors = {
@@ -32,16 +29,13 @@ def rooms(*places: float, gap: float = 0.0, contents=()):
         for i, x in enumerate(places)
     }
     scene = scene_of(*(shape | {"bsdf": PAINT} for shape in shapes), **sensors)
-    coarse = coarse_mesh(scene, BUDGET)
-    patch_of_point = only_standing(coarse.points, coarse.patches, coarse.patch_of_point)
-    coarse = replace(coarse, patch_of_point=patch_of_point)
-    return coarse, find_spaces(scene, coarse.points, coarse.patch_of_point)
+    return find_spaces(scene, only_standing(coarse_mesh(scene, BUDGET)))
 
 
-def spaces_at(coarse, space, chosen) -> set[int]:
+def spaces_at(coarse, chosen) -> set[int]:
     """The spaces of the points on the floor that are chosen by their x."""
     x, y, z = coarse.points.position.T
-    return set(space[chosen(x) & (abs(y) < 1.99) & (z < -1.99)].tolist())
+    return set(coarse.space_of_point[chosen(x) & (abs(y) < 1.99) & (z < -1.99)].tolist())
 
 
 def left(x):
@@ -56,60 +50,49 @@ def right(x):
 
 
 def test_rooms_that_sensors_are_in_are_spaces():
-    coarse, space = rooms(-1, 1)
-    here, there = (spaces_at(coarse, space, side) - {-1} for side in (left, right))
+    coarse = rooms(-1, 1)
+    here, there = (spaces_at(coarse, side) - {-1} for side in (left, right))
     assert len(here) == len(there) == 1 and here != there
 
 
 @pytest.mark.parametrize("places", [(-1.0, -1.2), (-1.0, 1.0)])
 def test_sensors_that_see_the_same_share_a_space(places):
-    _, space = rooms(*places, gap=0.3)
-    assert space.max() == 0
+    assert rooms(*places, gap=0.3).space_of_point.max() == 0
 
 
 def test_a_room_without_sensor_is_in_no_known_space():
-    coarse, space = rooms(-1)
-    assert spaces_at(coarse, space, right) == {-1}
-    assert 0 in spaces_at(coarse, space, left)
+    coarse = rooms(-1)
+    assert spaces_at(coarse, right) == {-1}
+    assert 0 in spaces_at(coarse, left)
 
 
 def test_the_inside_of_a_closed_box_is_in_no_known_space():
     """However small it is."""
-    coarse, space = rooms(-1, contents=[block(-1, 0, 0, 0.1)])
+    coarse = rooms(-1, contents=[block(-1, 0, 0, 0.1)])
     offset = coarse.points.position - np.array([-1, 0, 0])
     on_box = abs(offset).max(axis=1) < 0.11
     inside = on_box & ((offset * coarse.points.normal).sum(axis=1) < 0)
-    assert inside.any() and (space[inside] == -1).all()
+    assert inside.any() and (coarse.space_of_point[inside] == -1).all()
 
 
 def test_without_sensors_all_is_one_space():
-    _, space = rooms()
-    assert (space == 0).all()
+    assert (rooms().space_of_point == 0).all()
 
 
 # ---------------------- Patches ----------------------
 
 
-def separated(coarse, space):
-    cell_of_point = np.zeros(len(coarse.points), dtype=np.int64)
-    return separate(
-        coarse.scene,
-        coarse.object_ids,
-        coarse.patches,
-        coarse.points,
-        coarse.patch_of_point,
-        cell_of_point,
-        space,
-    )
+def separated(coarse):
+    one_cell = np.zeros(len(coarse.points), dtype=np.int64)
+    return separate(coarse.scene, coarse.object_ids, replace(coarse, cell_of_point=one_cell))
 
 
 def test_no_patch_is_looked_up_from_the_other_room():
-    coarse, space = rooms(-1, 1)
-    patches, patch_of_point, _ = separated(coarse, space)
-    seen = (coarse.points.seen > 0) & (patch_of_point >= 0)
-    space_of_patch = np.full(patches.count, -1)
-    space_of_patch[patch_of_point[seen]] = space[seen]
-    after = replace(coarse, patches=patches, patch_of_point=patch_of_point)
+    coarse = rooms(-1, 1)
+    after, space = separated(coarse), coarse.space_of_point
+    seen = (coarse.points.seen > 0) & (after.patch_of_point >= 0)
+    space_of_patch = np.full(after.patches.count, -1)
+    space_of_patch[after.patch_of_point[seen]] = space[seen]
     random = np.random.default_rng(1)
     for _ in range(8):
         patch, _, found = after.find(coarse.points, random.random((2, len(coarse.points))))
@@ -121,16 +104,16 @@ def test_no_patch_is_looked_up_from_the_other_room():
 @pytest.mark.parametrize("places", [(-1,), (-1, 1)])
 def test_in_a_single_space_patches_that_sensors_see_remain(places):
     """But for those of which a part may lie in another, as nothing on a walk sees it."""
-    coarse, space = rooms(*places, gap=0.3)
-    seen = coarse.points.seen > 0
-    before, after = coarse.patch_of_point, separated(coarse, space)[1]
+    coarse = rooms(*places, gap=0.3)
+    space, seen = coarse.space_of_point, coarse.points.seen > 0
+    before, after = coarse.patch_of_point, separated(coarse).patch_of_point
     in_doubt = np.isin(before, before[(before >= 0) & (space < 0)])
     assert np.array_equal(after[seen & ~in_doubt], before[seen & ~in_doubt])
     assert (after[seen] >= 0).mean() > 0.95
 
 
 def test_patches_that_no_sensor_comes_to_are_dropped():
-    coarse, space = rooms(-1)
-    patch_of_point = separated(coarse, space)[1]
+    coarse = rooms(-1)
+    patch_of_point = separated(coarse).patch_of_point
     outside = (coarse.points.position[:, 0] > WALL + 0.5).nonzero()
     assert (patch_of_point[outside] == -1).all()

@@ -30,7 +30,7 @@ def test_a_view_is_named_by_where_it_looks():
 
 def test_a_view_of_the_same_room_is_served():
     coarse = coarse_mesh(load(room()), 1024, points_per_patch=32)
-    usual = usual_service(coarse.points, coarse.patch_of_point)
+    usual = usual_service(coarse)
     assert usual.found > 0.9 and usual.patches > 100
     for origin in ((0.5, -1.7, 0.6), (-1.5, 1.5, 1.0)):
         other = mi.load_dict(camera(origin=origin))
@@ -41,7 +41,7 @@ def test_a_view_of_the_same_room_is_served():
 def test_a_view_of_another_room_is_not():
     far = box(2.0) | {"to_world": mi.ScalarTransform4f().translate([10, 0, 0]).scale(2)} | grey(0.5)
     coarse = coarse_mesh(load(room(other=far)), 1024, points_per_patch=32)
-    usual = usual_service(coarse.points, coarse.patch_of_point)
+    usual = usual_service(coarse)
     other = mi.load_dict(camera(origin=(10, -1.8, 0.4), target=(10, 0.5, -1)))
     found = service(coarse.scene, coarse.object_ids, coarse.patches, other)
     assert found.found < 0.1
@@ -56,7 +56,7 @@ def test_patches_too_large_for_a_view_do_not_serve_it():
 
 def test_a_mesh_made_for_no_view_serves_none():
     coarse = coarse_mesh(scene_of(box(2.0) | grey(0.5)), 256)
-    usual = usual_service(coarse.points, coarse.patch_of_point)
+    usual = usual_service(coarse)
     assert usual == UNKNOWN
     sensor = mi.load_dict(camera())
     assert not service(coarse.scene, coarse.object_ids, coarse.patches, sensor).suffices(usual)
@@ -66,5 +66,5 @@ def test_a_view_that_asks_for_nothing_is_served():
     coarse = coarse_mesh(load(room()), 256)
     away = mi.load_dict(camera(origin=(0, -30, 0), target=(0, -60, 0)))
     found = service(coarse.scene, coarse.object_ids, coarse.patches, away)
-    assert found.suffices(usual_service(coarse.points, coarse.patch_of_point))
+    assert found.suffices(usual_service(coarse))
     assert np.isinf(found.patches)

@@ -9,8 +9,9 @@ import mitsuba as mi
 import numpy as np
 
 from ...lookup.ids import ObjectIds
-from ...lookup.patches import BUCKET, DROPPED, LEVEL_BITS, MARK_BITS, UNEVEN, Patches, cell_hash
+from ...lookup.patches import BUCKET, LEVEL_BITS, MARK_BITS, Patches, cell_hash
 from ...system.jit import opaque_point, upload
+from .mesh import CoarseMesh
 from .surface_points import SurfacePoints
 
 #: Edge of the large cells as a fraction of the diagonal of the box that holds most surface points
@@ -21,18 +22,17 @@ MAX_LEVEL = 12
 BOXED = 8
 
 
-def build_patches(
+def build_mesh(
     points: SurfacePoints, object_ids: ObjectIds, budget: int, divided: np.ndarray | None = None
-) -> tuple[Patches, np.ndarray, np.ndarray]:
+) -> CoarseMesh:
     """Build the coarse mesh over ``points`` with about ``budget`` patches.
 
-    ``divided`` tells how often each large cell [C] is divided beyond what its points suggest.
-    Returns the patches and, of every point, the patch index and the large cell's [N], -1 where
-    it has none.
+    ``divided`` tells how often each large cell [C] is divided beyond what its points suggest. All
+    points are taken to be in one space.
     """
     if len(points) == 0:  # Nothing but mirrors and glass.
         empty = np.zeros(0, dtype=np.int64)
-        return _no_patches(), empty, empty
+        return CoarseMesh(points, _no_patches(), empty, empty, empty)
     (low, _), extent = points.box, points.extent
     position, normal, object_id = points.places()
     size = extent * LARGE_CELL
@@ -73,7 +73,8 @@ def build_patches(
     cells, cell_of_point = np.unique(key, return_inverse=True)
     cells, patch_of_cell = _hash_table(cells & ~np.uint64((1 << MARK_BITS) - 1))
     patches = replace(patches, levels=upload(mi.UInt32, levels), cells=upload(mi.UInt32, cells))
-    return patches, patch_of_cell[cell_of_point], large_of_point
+    space = np.zeros(len(points), dtype=np.int64)
+    return CoarseMesh(points, patches, patch_of_cell[cell_of_point], large_of_point, space)
 
 
 def _filled(position, cell_of_point, n_points, size) -> np.ndarray:
@@ -94,24 +95,6 @@ def _filled(position, cell_of_point, n_points, size) -> np.ndarray:
     # n points at random leave a margin of 1 / (n + 1) on either side.
     filled = longest_first[:2] / size * (n_points + 1) / np.maximum(n_points - 1, 1)
     return np.where(n_points < BOXED, 1, np.minimum(filled, 1))
-
-
-def drop(
-    patches: Patches, patch_of_point: np.ndarray, dropped: np.ndarray
-) -> tuple[Patches, np.ndarray]:
-    """Leave out some patches [P]: paths that come there are traced on.
-
-    Returns the remaining patches and the patch of every surface point [N], -1 where it has none.
-    """
-    cells = patches.cells.numpy() | np.where(dropped, np.uint32(DROPPED), np.uint32(0))
-    kept = (patch_of_point >= 0) & ~dropped[patch_of_point]
-    return replace(patches, cells=upload(mi.UInt32, cells)), np.where(kept, patch_of_point, -1)
-
-
-def mark_uneven(patches: Patches, uneven: np.ndarray) -> Patches:
-    """Let some patches [P] stand for indirect light alone: shadow rays bring the direct light."""
-    cells = patches.cells.numpy() | np.where(uneven, np.uint32(UNEVEN), np.uint32(0))
-    return replace(patches, cells=upload(mi.UInt32, cells))
 
 
 def _no_patches() -> Patches:

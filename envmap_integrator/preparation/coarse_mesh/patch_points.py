@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy.sparse import coo_matrix
 
-from ...lookup.patches import PARTS, Patches
+from ...lookup.patches import PARTS
 from ...system.jit import upload
-from .surface_points import SurfacePoints
+from .mesh import CoarseMesh
 
 #: Parts of the box about a patch's points along each axis in which rays start equally often.
 STRATA = 4
@@ -21,20 +23,23 @@ class PatchPoints:
     patches   [K]      indices of the patches that have points
     first     [K + 1]  where the points of each begin
     index              which points stand for patches, sorted
+    cells     [K]      large cell of each patch, -1 if it has none
     points             all surface points
     """
 
-    def __init__(self, points: SurfacePoints, patch_of_point: np.ndarray, n_patches: int):
+    def __init__(self, mesh: CoarseMesh):
+        points, patch_of_point = mesh.points, mesh.patch_of_point
         standing = np.flatnonzero(patch_of_point >= 0)
         # Rows of a sparse matrix: a counting sort.
         place = patch_of_point[standing], np.arange(len(standing))
-        by_patch = coo_matrix((standing, place), (n_patches, len(standing))).tocsr()
+        by_patch = coo_matrix((standing, place), (mesh.patches.count, len(standing))).tocsr()
         self.patches = np.flatnonzero(np.diff(by_patch.indptr))
         self.first = np.append(by_patch.indptr[self.patches], len(standing)).astype(np.uint32)
         self.points = points
         key = self._parts(points.position[by_patch.data])
         order = np.argsort(key, kind="stable")
         self.index = by_patch.data[order]
+        self.cells = mesh.cell_of_point[self.index[self.first[:-1]]]
         part, first_of_part = np.unique(key[order], return_index=True)
         first_part = np.searchsorted(part, STRATA**3 * np.arange(len(self.patches) + 1))
         self._first_part = upload(mi.UInt32, first_part)
@@ -74,21 +79,21 @@ def _among(first: mi.UInt32, group: mi.UInt32, u: mi.Float) -> tuple[mi.UInt32, 
     return begin + k, u - mi.Float(k)
 
 
-def only_standing(
-    points: SurfacePoints, patches: Patches, patch_of_point: np.ndarray
-) -> np.ndarray:
-    """The patch of every surface point [N] that stands for it, -1 for the others.
+def only_standing(mesh: CoarseMesh) -> CoarseMesh:
+    """The mesh with only those of a patch's surface points that stand for it.
 
     In the parts of a patch that walks from the sensors have come to, only their points stand for
     it: global lines also hit what no light reaches, such as the floor under a cupboard, which would
     darken what looks out.
     """
+    points, patches, patch_of_point = mesh.points, mesh.patches, mesh.patch_of_point
     if len(points) == 0:  # Nothing but mirrors and glass.
-        return patch_of_point
+        return mesh
     place = points.places()
     _, size, _ = patches.find_cell(*place)
     part = PARTS * patch_of_point + patches.part(place[0], size).numpy()
     has_patch, seen = patch_of_point >= 0, points.seen > 0
     visited = np.zeros(PARTS * patches.count, dtype=bool)
     visited[part[has_patch & seen]] = True
-    return np.where(has_patch & (seen | ~visited[part]), patch_of_point, -1)
+    standing = has_patch & (seen | ~visited[part])
+    return replace(mesh, patch_of_point=np.where(standing, patch_of_point, -1))

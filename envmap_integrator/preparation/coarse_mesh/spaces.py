@@ -5,6 +5,8 @@ A patch or a cluster on both sides of a wall, however thin, would let light thro
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -12,10 +14,9 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from ...lookup.ids import ObjectIds
-from ...lookup.patches import Patches
 from ...system.jit import upload
 from ...system.ray_counts import Ray, count
-from .build import drop
+from .mesh import CoarseMesh
 from .surface_points import SurfacePoints
 
 #: Pairs of points on walks that are tested for sight of each other.
@@ -30,19 +31,18 @@ UNKNOWN = 0xFFFFFFFF
 LOOKS = 16
 
 
-def find_spaces(
-    scene: mi.Scene, points: SurfacePoints, patch_of_point: np.ndarray, seed: int = 0
-) -> np.ndarray:
-    """The space [N] of every surface point, counted from 0; -1 where it isn't known.
+def find_spaces(scene: mi.Scene, mesh: CoarseMesh, seed: int = 0) -> CoarseMesh:
+    """The mesh with the space of every surface point.
 
     A walk stays in the space of its sensor. Sensors are in the same one if their walks see each
     other. Other points are in that of a walk that they see, which is tested only for those that
     stand for patches. Without sensors, all is one space.
     """
+    points = mesh.points
     walk = points.seen.astype(np.int64)
     walked = np.flatnonzero(walk)
     if len(walked) == 0:
-        return np.zeros(len(points), dtype=np.int64)
+        return mesh
     space = np.where(walk > 0, 0, -1)
     sight = _Sight(scene, points)
     if walk.max() > 1:
@@ -52,10 +52,10 @@ def find_spaces(
         n_nodes = int(walk.max()) + 1  # The first stands for no sensor.
         links = coo_matrix((np.ones(linked.sum()), ends), (n_nodes, n_nodes))
         space = connected_components(links, directed=False)[1][walk] - 1
-    others = np.flatnonzero((patch_of_point >= 0) & (walk == 0))
+    others = np.flatnonzero((mesh.patch_of_point >= 0) & (walk == 0))
     if len(others):
         space[others] = space[sight.first_seen(others, walked, seed)]
-    return space
+    return replace(mesh, space_of_point=space)
 
 
 class _Sight:
@@ -106,16 +106,7 @@ def _first_seen(sight, point, targets, n_targets, sampler):
     return seen
 
 
-def separate(
-    scene: mi.Scene,
-    object_ids: ObjectIds,
-    patches: Patches,
-    points: SurfacePoints,
-    patch_of_point: np.ndarray,
-    cell_of_point: np.ndarray,
-    space: np.ndarray,
-    seed: int = 0,
-) -> tuple[Patches, np.ndarray, np.ndarray]:
+def separate(scene: mi.Scene, object_ids: ObjectIds, mesh: CoarseMesh, seed: int = 0) -> CoarseMesh:
     """Drop patches that might bring light from one space to another.
 
     These are the ones in several spaces, the ones that aren't known to be in any, as what they
@@ -123,23 +114,22 @@ def separate(
     isn't their own. In the usual case of a single space there are none of the last kind, whatever
     closed rooms and boxes no sensor comes to: what is left has been seen from the sensors' space.
 
-    Returns the remaining patches and, of every surface point [N], the patch and the large cell,
-    -1 where it has none, where its space isn't known and where the cell lies in several.
+    Points whose space isn't known, and those in large cells that lie in several, have no large cell
+    in the mesh that it returns.
     """
-    standing = patch_of_point >= 0
-    patch = patch_of_point[standing]
-    space_of_patch = np.full(patches.count, -1)
+    space = mesh.space_of_point
+    standing = mesh.patch_of_point >= 0
+    patch = mesh.patch_of_point[standing]
+    space_of_patch = np.full(mesh.patches.count, -1)
     space_of_patch[patch] = space[standing]
     space_of_patch[patch[space_of_patch[patch] != space[standing]]] = -1
     dropped = space_of_patch < 0
-    cell_of_point = np.where(space < 0, -1, cell_of_point)
+    cell_of_point = np.where(space < 0, -1, mesh.cell_of_point)
     if space.max(initial=0) > 0:
-        foreign, mixed = _look_around(
-            scene, object_ids, patches, points, space, space_of_patch, seed
-        )
+        foreign, mixed = _look_around(scene, object_ids, mesh, space_of_patch, seed)
         dropped |= foreign
         cell_of_point = np.where(mixed[cell_of_point], -1, cell_of_point)
-    return *drop(patches, patch_of_point, dropped), cell_of_point
+    return replace(mesh.without(dropped), cell_of_point=cell_of_point)
 
 
 def _looked_at(scene, object_ids, patches, si, space_of_patch, sampler, active) -> mi.UInt32:
@@ -154,11 +144,12 @@ def _looked_at(scene, object_ids, patches, si, space_of_patch, sampler, active) 
     return dr.select(found, dr.gather(mi.UInt32, space_of_patch, patch, found), UNKNOWN)
 
 
-def _look_around(scene, object_ids, patches, points, space, space_of_patch, seed):
+def _look_around(scene, object_ids, mesh, space_of_patch, seed):
     """Which patches [P] are looked up from other spaces, which large cells [C] from several.
 
     Tested from all points: walks hardly come to the nooks by a wall, but paths of the renderer do.
     """
+    points, patches, space = mesh.points, mesh.patches, mesh.space_of_point
     n_lanes = LOOKS * len(points)
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, n_lanes)

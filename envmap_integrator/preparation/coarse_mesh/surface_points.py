@@ -111,7 +111,7 @@ class SurfacePoints:
         )
 
     def take(self, index: np.ndarray) -> SurfacePoints:
-        """The points of the given indices, in that order."""
+        """The points of the given indices, in that order, or those of a mask."""
         return SurfacePoints(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
     @staticmethod

@@ -10,7 +10,8 @@ import numpy as np
 
 from ...lookup.ids import ObjectIds
 from ...lookup.patches import Patches
-from .surface_points import SurfacePoints, walk_from
+from .mesh import CoarseMesh
+from .surface_points import walk_from
 
 #: Rays of the walks that test a new view.
 RAYS = 4096
@@ -46,11 +47,11 @@ def view_name(sensor: mi.Sensor) -> str:
     return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
 
-def usual_service(points: SurfacePoints, patch_of_point: np.ndarray) -> Service:
+def usual_service(mesh: CoarseMesh) -> Service:
     """The least that a mesh does for any of the sensors whose walks it was made of."""
-    later = points.bounce > 0
+    points, later = mesh.points, mesh.points.bounce > 0
     each = [
-        _service(patch_of_point[later & (points.seen == sensor)])
+        _service(mesh.patch_of_point[later & (points.seen == sensor)])
         for sensor in np.unique(points.seen[later & (points.seen > 0)])
     ]
     if not each:

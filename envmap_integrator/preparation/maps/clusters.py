@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 
 from ...lookup.cube_map import Cluster
 from ...system.scene_order import ordered_shapes
+from ..coarse_mesh.mesh import CoarseMesh
 from ..coarse_mesh.surface_points import SurfacePoints
 
 #: Flat pieces longer than this fraction of the scene are surroundings (floors, walls).
@@ -159,13 +161,12 @@ def worthwhile(
     return escaped_share[seen & mapped].sum() > LOOK_UP_COST * seen.sum()
 
 
-def cluster_of_cell(
-    n_clusters: int, cluster_of_point: np.ndarray, cell_of_point: np.ndarray, n_cells: int
-) -> np.ndarray:
-    """Cluster of every large cell of the coarse mesh, ``n_clusters`` where it belongs to none.
+def cluster_of_cell(n_clusters: int, cluster_of_point: np.ndarray, mesh: CoarseMesh) -> np.ndarray:
+    """Cluster of every large cell [C] of a coarse mesh, ``n_clusters`` where it belongs to none.
 
     A cell belongs to the cluster that most of its surface points belong to, if there are any.
     """
+    cell_of_point, n_cells = mesh.cell_of_point, dr.width(mesh.patches.levels)
     known = cell_of_point >= 0
     cluster = np.where(cluster_of_point < 0, n_clusters, cluster_of_point)
     slot = (n_clusters + 1) * cell_of_point[known] + cluster[known]

@@ -53,7 +53,6 @@ def coarseness(
     arriving: np.ndarray,
     importance: np.ndarray,
     members: PatchPoints,
-    cell_of_point: np.ndarray,
     n_cells: int,
 ) -> Coarseness:
     """Compare what paths read with what is found where they read it.
@@ -83,7 +82,7 @@ def coarseness(
     excess = weight * (read - found[place, row & 1])
     patch = place // PARTS
     cell_of_patch = np.full(n_patches, -1)
-    cell_of_patch[members.patches] = cell_of_point[members.index[members.first[:-1]]]
+    cell_of_patch[members.patches] = members.cells
     by_patch = np.bincount(patch, excess, n_patches)
 
     # ---- How sure that is: by what a ray adds to it, as one of its part and one of its patch ----

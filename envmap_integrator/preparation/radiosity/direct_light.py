@@ -9,12 +9,12 @@ import mitsuba as mi
 import numpy as np
 
 from ...lookup.emitter_choice import Emitters, SourceChoice
-from ...lookup.patches import Patches, normal_direction
+from ...lookup.patches import normal_direction
 from ...system.jit import mean_channel, upload, upload_vectors
 from ...system.ray_counts import Ray, count
 from ..coarse_mesh.build import cell_keys
+from ..coarse_mesh.mesh import CoarseMesh
 from ..coarse_mesh.patch_points import PatchPoints
-from ..coarse_mesh.surface_points import SurfacePoints
 from .alias_tables import alias_tables, by_weight
 
 #: Shadow rays per patch.
@@ -48,20 +48,18 @@ class DirectLight:
 def survey_direct_light(
     scene: mi.Scene,
     emitters: Emitters,
-    points: SurfacePoints,
-    patch_of_point: np.ndarray,
-    n_patches: int,
+    mesh: CoarseMesh,
     seed: int = 0,
 ) -> DirectLight:
     """Send ``SAMPLES`` shadow rays from random surface points of each patch."""
-    members = PatchPoints(points, patch_of_point, n_patches)
+    members = PatchPoints(mesh)
     n = len(members.patches) * SAMPLES
     if n == 0:
         return DirectLight(members, mi.Float(), mi.UInt32(), mi.Point3f())
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, n)
     point = members.sample(dr.arange(mi.UInt32, n) // SAMPLES, sampler.next_1d())
-    si = points.interaction(point)
+    si = mesh.points.interaction(point)
     choice = by_weight(emitters)
     ds, light = sample_irradiance(scene, choice, si, mi.UInt32(0), sampler.next_2d())
     irradiance = finite(mean_channel(light))
@@ -73,9 +71,7 @@ def survey_direct_light(
 def choose_sources(
     emitters: Emitters,
     light: DirectLight,
-    points: SurfacePoints,
-    cell_of_point: np.ndarray,
-    patches: Patches,
+    mesh: CoarseMesh,
 ) -> SourceChoice:
     """Probabilities of the emitters in each large cell, by the light found of them there.
 
@@ -94,10 +90,11 @@ def choose_sources(
         return by_weight(emitters)
 
     # ---- Which rays left from each cell ----
-    point = light.members.index[light.members.first[:-1]]
-    in_cell = cell_of_point[point] >= 0
-    point = point[in_cell]
-    cells, first, cell = np.unique(cell_of_point[point], return_index=True, return_inverse=True)
+    in_cell = light.members.cells >= 0
+    point = light.members.index[light.members.first[:-1]][in_cell]
+    cells, first, cell = np.unique(
+        light.members.cells[in_cell], return_index=True, return_inverse=True
+    )
     n_rays = SAMPLES * np.bincount(cell, minlength=len(cells))
     lit = square.reshape(-1, SAMPLES)[in_cell] > 0
     cell = np.repeat(cell, lit.sum(axis=1))
@@ -109,7 +106,7 @@ def choose_sources(
     row = np.full(len(cells), -1)
     rows, n_rows = [], 0
     waiting = np.ones(len(cells), dtype=bool)
-    for group in _surroundings(points, point[first], patches):
+    for group in _surroundings(mesh, point[first]):
         informed = np.bincount(group, n_rays)[group] >= RAYS_PER_EMITTER * n
         new = waiting & informed & (np.bincount(group, n_lit)[group] > 0)
         waiting &= ~informed
@@ -126,7 +123,7 @@ def choose_sources(
             break
     # The last row is for the rest, and for the empty slots of the cells' hash table.
     rows.append(np.bincount(emitter, square, n)[None])
-    row_of_cell = np.full(dr.width(patches.levels), n_rows)
+    row_of_cell = np.full(dr.width(mesh.patches.levels), n_rows)
     row_of_cell[cells] = np.where(row < 0, n_rows, row)
 
     found = np.sqrt(np.concatenate(rows))
@@ -136,13 +133,14 @@ def choose_sources(
     return SourceChoice(emitters, table, upload(mi.UInt32, row_of_cell))
 
 
-def _surroundings(points: SurfacePoints, index: np.ndarray, patches: Patches):
+def _surroundings(mesh: CoarseMesh, index: np.ndarray):
     """Ever larger groups of cells, of which ``index`` gives a surface point of each.
 
     First each cell is its own group; then those that face the same way in cubes of twice the edge,
     four times … Yields the group [C] of each cell.
     """
     yield np.arange(len(index))
+    points, patches = mesh.points, mesh.patches
     position = upload_vectors(mi.Point3f, points.position[index])
     facing = normal_direction(upload_vectors(mi.Normal3f, points.normal[index]))
     size = patches.size[0]

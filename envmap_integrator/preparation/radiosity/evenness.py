@@ -6,8 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...lookup.patches import Patches
-from ..coarse_mesh.build import drop, mark_uneven
+from ..coarse_mesh.mesh import CoarseMesh
 from .direct_light import SAMPLES, DirectLight
 
 #: Slices of a patch along each axis that are compared.
@@ -19,25 +18,23 @@ EDGE, UNEVEN = 2.0, 1.25
 SIGNIFICANCE, MIN_LIT = 4.0, 6.0
 
 
-def sort_out_uneven(
-    light: DirectLight, patches: Patches, patch_of_point: np.ndarray
-) -> tuple[Patches, np.ndarray]:
+def sort_out_uneven(light: DirectLight, mesh: CoarseMesh) -> CoarseMesh:
     """Drop patches across sharp edges of light, and mark those across soft ones.
 
     The first would leak: light on one side of a door frame into the dark room on the other. Paths
     that come there are traced on instead. Of the others, shadow rays bring the direct light, as
     their mean misplaces it: light may leave a room through a slit that shows a part of them.
     Patches are marked too where bumps turn the normals, which is unevenness at a finer scale.
-    Returns the remaining patches and the patch of every surface point [N], -1 where it has none.
     """
     if len(light) == 0:
-        return patches, patch_of_point
-    marked, dropped = (np.zeros(patches.count, dtype=bool) for _ in range(2))
+        return mesh
+    patch_of_point = mesh.patch_of_point
+    marked, dropped = (np.zeros(mesh.patches.count, dtype=bool) for _ in range(2))
     edge, uneven = contrasts(light.irradiance, light.position)
     dropped[light.members.patches[edge.numpy()]] = True
     marked[light.members.patches[uneven.numpy()]] = True
     marked[patch_of_point[light.members.points.turned & (patch_of_point >= 0)]] = True
-    return drop(mark_uneven(patches, marked), patch_of_point, dropped)
+    return mesh.with_uneven(marked).without(dropped)
 
 
 def contrasts(irradiance: mi.Float, position: mi.Point3f) -> tuple[mi.Bool, mi.Bool]:

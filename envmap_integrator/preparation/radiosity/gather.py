@@ -99,7 +99,6 @@ def gather(
     scene: mi.Scene,
     transport: Transport,
     members: PatchPoints,
-    cell_of_point: np.ndarray,
     rank: np.ndarray,
     samples: int,
     seed: int,
@@ -109,7 +108,7 @@ def gather(
     Rays start from random ones of the points, with as many shadow rays. ``samples`` must be a power
     of two.
     """
-    cells = upload(mi.UInt32, cell_of_point[members.index[members.first[:-1]]])
+    cells = upload(mi.UInt32, members.cells)
     position, normal, object_id = members.points.places()
     _, size, _ = transport.patches.find_cell(position, normal, object_id)
     parts = transport.patches.part(position, size)

@@ -17,8 +17,8 @@ from ...lookup.irradiance_cache import IrradianceCache
 from ...system.jit import give_back, upload
 from ...system.progress import stage
 from ...transport.path import Transport
+from ..coarse_mesh.mesh import CoarseMesh
 from ..coarse_mesh.patch_points import PatchPoints
-from ..coarse_mesh.surface_points import SurfacePoints
 from .gather import FLOATS_PER_RAY, Blocks, GatherRays, block_mean, gather
 from .noise import Noise, cache_noise
 
@@ -57,9 +57,7 @@ class Solution:
 def solve_irradiance(
     scene: mi.Scene,
     transport: Transport,
-    points: SurfacePoints,
-    patch_of_point: np.ndarray,
-    cell_of_point: np.ndarray,
+    mesh: CoarseMesh,
     samples: int,
     more_rays: int = 0,
     may_divide: bool = False,
@@ -73,8 +71,8 @@ def solve_irradiance(
     b the light that gather rays find outside the patches, and w the throughput with which they
     end in patch j, the solution fulfils E_i = mean(π b + w E(j)), where E(j) is E_d + E_i or E_i.
     """
-    n_patches = transport.patches.count
-    members = PatchPoints(points, patch_of_point, n_patches)
+    n_patches = mesh.patches.count
+    members = PatchPoints(mesh)
     n_channels, n_used = len(mi.Spectrum()), len(members.patches)
     if n_used == 0:  # Nothing but mirrors and glass.
         table = dr.zeros(mi.Float, 2 * n_patches * n_channels)
@@ -83,14 +81,14 @@ def solve_irradiance(
         return Solution(cache, None, np.zeros(n_patches), no_cell)
 
     def send(rank, seed):
-        return gather(scene, transport, members, cell_of_point, rank, samples, seed)
+        return gather(scene, transport, members, rank, samples, seed)
 
     rank = np.arange(n_used)
     for further in range(len(MORE) + 1):
         rays = send(rank, seed + further * SEED_STEP)
         blocks = Blocks(rank, n_used)
         cache = IrradianceCache(transport.patches, _solve(n_patches, members.patches, rays, blocks))
-        noise = cache_noise(rays, blocks, cache, members, cell_of_point)
+        noise = cache_noise(rays, blocks, cache, members)
         steep = noise.steep & (may_divide and further < len(MORE))
         if further == len(MORE) or steep.any():
             break

@@ -83,7 +83,6 @@ def cache_noise(
     blocks: Blocks,
     cache: IrradianceCache,
     members: PatchPoints,
-    cell_of_point: np.ndarray,
 ) -> Noise:
     """Find out how uncertain a cache is that was solved from ``blocks`` of ``rays``."""
     samples, rank = rays.samples, blocks.rank
@@ -97,7 +96,7 @@ def cache_noise(
     # What is seen first gathers by rays of its own, as if it were patches.
     importance = (indirect + views).sum(axis=1)
     arriving = of_patches.numpy()
-    coarse = coarseness(rays, blocks, table, arriving, importance, members, cell_of_point, n_cells)
+    coarse = coarseness(rays, blocks, table, arriving, importance, members, n_cells)
 
     # ---- Scatter within each block: rays k and k ^ step start in neighbouring directions ----
     step = 1 << (samples.bit_length() - 1) // 2
@@ -127,7 +126,7 @@ def cache_noise(
     variance = variance.sum(axis=1)
 
     # ---- In its surroundings ----
-    cell = np.unique(cell_of_point[members.index[members.first[:-1]]], return_inverse=True)[1]
+    cell = np.unique(members.cells, return_inverse=True)[1]
 
     def around(values):
         return (np.bincount(cell, values) / np.bincount(cell))[cell]
