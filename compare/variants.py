@@ -14,8 +14,7 @@ import mitsuba as mi
 from compare.scenes import HYBRID, Subject
 from envmap_integrator.lookup.far_field import FarField
 from envmap_integrator.lookup.patches import Patches
-from envmap_integrator.transport import camera
-from envmap_integrator.transport import path as transport
+from envmap_integrator.transport import direct_light, lobes
 
 FINEST = -32.0
 """``mip_bias`` with which every look-up reads the finest level."""
@@ -61,14 +60,14 @@ def patches_unblended() -> AbstractContextManager:
 @contextmanager
 def only_diffuse_is_wide() -> Iterator[None]:
     """Irradiance stands for no lobe but those that are diffuse; all others are traced on."""
-    is_wide = transport.is_wide
+    is_wide = lobes.is_wide
 
     def is_diffuse(si, wo, pdf):
-        return is_wide(si, wo, pdf) & transport.only_wide(si.bsdf())
+        return is_wide(si, wo, pdf) & lobes.only_wide(si.bsdf())
 
     with (
-        patch.object(transport, "is_wide", is_diffuse),
-        patch.object(camera, "is_wide", is_diffuse),
+        patch.object(lobes, "is_wide", is_diffuse),
+        patch.object(direct_light, "is_wide", is_diffuse),
     ):
         yield
 

@@ -1,24 +1,28 @@
-"""What the integrators share: preparation and the sampling kernel."""
+"""What the integrators share: preparation, once, and rendering."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
-from ..imaging.film import INDIRECT_AOVS, expose, expose_gathered, most_samples, n_pixels_of, rgb
-from ..lookup.emitter_choice import Emitters, SourceChoice
-from ..lookup.ids import ObjectIds
+from ..imaging.film import (
+    INDIRECT_AOVS,
+    expose,
+    expose_gathered,
+    most_samples,
+    n_pixels_of,
+    rgb,
+)
+from ..lookup.far_field import FarField
 from ..preparation.baked_state import BakedState, Settings, StateKey, load
 from ..preparation.coarse_mesh.views import service, view_name
 from ..preparation.pipeline import prepare
+from ..preparation.scene_state import SceneState, SceneStates
 from ..system.checks import check_not_frozen, check_scene, check_variant
-from ..system.fingerprint import SceneContent, SceneFingerprint
 from ..system.interrupt import interruptible
 from ..system.parameters import Parameters
 from ..transport.camera import CameraSample, camera_radiance
-from ..transport.path import Residual, Transport
+from ..transport.rules import PathRules, Residual
 
 #: Our own sample points, Mitsuba's samplers, and that of the scene.
 SAMPLERS = (
@@ -36,24 +40,10 @@ MOST_STATES = 8
 DOUBTFUL = 0.01
 
 
-@dataclass(frozen=True)
-class SceneObjects:
-    """How kernels tell the objects of a scene apart, and the content for which that holds.
-
-    Other scenes of the same content have other objects, and shapes that move change places. Holding
-    on to the scene, which holds its integrator, would keep both alive for ever.
-    """
-
-    content: SceneContent
-    ids: ObjectIds
-    emitters: Emitters
-
-
 class CachedIntegrator(mi.SamplingIntegrator):
     """Base of all integrators that end their paths in the irradiance cache.
 
-    Subclasses say what the pre-passes depend on (``settings``) and how paths are followed
-    (``transport``).
+    Subclasses say what the pre-passes depend on (``settings``) and how paths go (``rules``).
     """
 
     LEAST_PATCH_SAMPLES = 32
@@ -71,18 +61,12 @@ class CachedIntegrator(mi.SamplingIntegrator):
         self.patches = parameters.integer("patches", None, 16, 1 << 22)
         self.patch_samples = parameters.power_of_two("patch_samples", None, 1, 1 << 16)
         self.shadow_samples = parameters.integer("shadow_samples", self.SHADOW_SAMPLES, 1, 1 << 16)
-        self.secondary_samples = 1
-        self.residual_probability = 0.0
-        self.irradiance_filter = False
-        self.indirect_aovs = False
-        self.clamp_indirect = 0.0
         self.sampler = parameters.choice("sampler", "coherent", SAMPLERS)
         self.cache_file = parameters.text("cache_file")
-        self._fingerprint = SceneFingerprint()
+        self._scenes = SceneStates()
         self._made_for: tuple[StateKey, str] | None = None
         self._prepared: dict[tuple[Settings, str], BakedState] = {}
-        self._objects: SceneObjects | None = None
-        self._seed = 0
+        self._passes = 0
 
     # ---------------------- To be overridden ----------------------
 
@@ -90,9 +74,24 @@ class CachedIntegrator(mi.SamplingIntegrator):
         """What the pre-passes depend on besides the scene."""
         return Settings(self.patches, self.patch_samples, self.LEAST_PATCH_SAMPLES, **more)
 
-    def transport(self, scene: mi.Scene, prepared: BakedState, spp: int) -> Transport:
-        """How paths are followed; ``spp`` samples share a pixel."""
+    def rules(self, seed: int) -> PathRules:
+        """How paths go; ``seed`` is that of a pass over the picture."""
         raise NotImplementedError
+
+    def far_field(self, scene: mi.Scene, baked: BakedState, spp: int) -> FarField | None:
+        """The maps, if there are any; ``spp`` samples share a pixel."""
+        return None
+
+    def aov_names(self) -> list[str]:
+        return []
+
+    def aovs(self, found: CameraSample) -> list[mi.Float]:
+        """Values of ``aov_names``."""
+        return []
+
+    def expose(self, sensor, sampler, spp, seed, shade) -> None:
+        """Render to the film of a sensor, as ``imaging.film.expose`` does."""
+        expose(sensor, sampler, spp, seed, shade, self.aov_names(), self.aovs)
 
     def to_string(self):
         parameters = {
@@ -121,7 +120,8 @@ class CachedIntegrator(mi.SamplingIntegrator):
         """
         check_not_frozen(self.owner)
         settings = self.settings()
-        key = StateKey(self._fingerprint(scene), settings)
+        now = self._scenes(scene)
+        key = StateKey(now.fingerprint, settings)
         if (key, self.cache_file) != self._made_for:
             check_scene(scene, self.owner)
             self._made_for, self._prepared = (key, self.cache_file), {}
@@ -136,12 +136,12 @@ class CachedIntegrator(mi.SamplingIntegrator):
         if not self.cache_file:
             settings = settings.for_render(_camera_samples(view, spp))
         if (settings, name) not in self._prepared:
-            state = self._that_serves(scene, settings, view)
+            state = self._that_serves(scene, now, settings, view)
             if state is None:
-                state = self._make(scene, key, settings, sensors)
+                state = self._make(scene, now, key, settings, sensors)
                 for served in state.views:
                     self._keep(settings, served, state)
-            if self.cache_file and not self._serves(state, scene, view):
+            if self.cache_file and not _serves(state, scene, now, view):
                 raise ValueError(
                     f'{self.owner}: "cache_file" {self.cache_file} was made for other views than '
                     "this sensor's; make it again with envmap-render bake, with this sensor in the "
@@ -157,26 +157,17 @@ class CachedIntegrator(mi.SamplingIntegrator):
         for old in states[:-MOST_STATES]:
             self._prepared = {k: s for k, s in self._prepared.items() if s is not old}
 
-    def _that_serves(self, scene, settings: Settings, view: mi.Sensor | None) -> BakedState | None:
+    def _that_serves(self, scene, now, settings, view) -> BakedState | None:
         """What has been prepared for other views, if it serves this one too."""
         states = {id(s): s for (its, _), s in self._prepared.items() if its == settings}
-        return next((s for s in states.values() if self._serves(s, scene, view)), None)
+        return next((s for s in states.values() if _serves(s, scene, now, view)), None)
 
-    def _serves(self, state: BakedState, scene: mi.Scene, view: mi.Sensor | None) -> bool:
-        if view is None or view_name(view) in state.views:
-            return True
-        with dr.suspend_grad():
-            found = service(scene, self.objects_of(scene).ids, state.cache.patches, view)
-        return found.suffices(state.service)
-
-    def _make(
-        self, scene, key: StateKey, settings: Settings, sensors: list[mi.Sensor]
-    ) -> BakedState:
+    def _make(self, scene, now, key, settings, sensors) -> BakedState:
         if self.cache_file:
             state = load(self.cache_file, key, self.owner, len(scene.emitters()))
         else:
             with interruptible(), dr.suspend_grad():
-                state = prepare(scene, key, settings, sensors, self.owner)
+                state = prepare(scene, now, key.settings, settings, sensors, self.owner)
         if state.relative_error > DOUBTFUL:
             mi.Log(
                 mi.LogLevel.Warn,
@@ -186,61 +177,31 @@ class CachedIntegrator(mi.SamplingIntegrator):
             )
         return state
 
-    def objects_of(self, scene: mi.Scene) -> SceneObjects:
-        """The same record as long as nothing in the scene changes."""
-        content = SceneContent(scene)
-        if self._objects is None or self._objects.content != content:
-            self._objects = SceneObjects(content, ObjectIds(scene), Emitters(scene))
-        return self._objects
-
-    def transport_from(self, scene: mi.Scene, prepared: BakedState, **more) -> Transport:
-        """A ``Transport`` with all that is the same for all integrators."""
-        objects = self.objects_of(scene)
-        return Transport(
-            prepared.cache.patches,
-            objects.ids,
-            SourceChoice(objects.emitters, prepared.sources, prepared.source_rows),
-            cache=prepared.cache,
-            shadow_samples=self.shadow_samples,
-            clamp=dr.opaque(mi.Float, self.clamp_indirect) if self.clamp_indirect else None,
-            **more,
-        )
-
     # ---------------------- Rendering ----------------------
-
-    def residual(self) -> Residual | None:
-        """How the errors of cache and maps are corrected, if they are."""
-        if self.residual_probability == 0:
-            return None
-        self._seed = mi.UInt32(self._seed) + 1  # Every pass of a render decides anew.
-        dr.make_opaque(self._seed)
-        probability = dr.opaque(mi.Float, self.residual_probability)
-        return Residual(probability, self._seed)
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
-        prepared = self.prepare(scene, sensor, spp)
-        self._seed = seed
+        baked = self.prepare(scene, sensor, spp)
         film = sensor.film()
         with interruptible(), dr.suspend_grad():
             sampler, spp = self._pixel_sampler(sensor, spp)
-            transport = self.transport(scene, prepared, spp)
+            lookup, rules = self._lookup(scene, baked, spp), self.rules(seed)
 
             def shade(sampler, ray, index):
-                return self.radiance(scene, transport.of_sample(index), sampler, ray, True)
+                return camera_radiance(
+                    scene, lookup, rules.of_sample(index), sampler, ray, mi.Bool(True)
+                )
 
-            shared = self.irradiance_filter and self.residual_probability == 0
-            if shared or self.indirect_aovs:
-                n_shared = spp * self.secondary_samples if shared else 0
-                expose_gathered(sensor, sampler, spp, seed, shade, n_shared, self.indirect_aovs)
-            else:
-                expose(sensor, sampler, spp, seed, shade, self.aov_names(), self.aovs)
+            self.expose(sensor, sampler, spp, seed, shade)
             picture = film.develop() if develop else mi.TensorXf()
             if evaluate:
                 film.schedule_storage()
                 dr.eval(picture)
         return picture
+
+    def _lookup(self, scene, baked: BakedState, spp: int):
+        return self._scenes(scene).lookup(baked, self.far_field(scene, baked, spp))
 
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
         self._refuse_gradients()
@@ -280,26 +241,14 @@ class CachedIntegrator(mi.SamplingIntegrator):
                 f"{self.owner}: within another integrator only sensors of the scene are known, and "
                 "there are none; add the sensor to the scene"
             )
-        transport = self.transport(scene, self.prepare(scene), sampler.sample_count())
-        found = self.radiance(scene, transport, sampler, ray, active)
+        lookup = self._lookup(scene, self.prepare(scene), sampler.sample_count())
+        self._passes += 1
+        rules = self.rules(self._passes)
+        ray, active = mi.Ray3f(ray), mi.Bool(active)
+        found = camera_radiance(scene, lookup, rules, sampler, ray, active)
         if dr.grad_enabled(found.radiance):
             self._refuse_gradients()
         return found.radiance, found.valid, self.aovs(found)
-
-    def aov_names(self) -> list[str]:
-        return list(INDIRECT_AOVS) if self.indirect_aovs else []
-
-    def aovs(self, found: CameraSample) -> list[mi.Float]:
-        """Values of ``aov_names``."""
-        if not self.indirect_aovs:
-            return []
-        gathered = found.gathered
-        return [c for x in (gathered.radiance, gathered.radiance, gathered.albedo) for c in rgb(x)]
-
-    def radiance(self, scene, transport, sampler, ray, active) -> CameraSample:
-        """As ``camera_radiance``, with the integrator's own number of secondary rays."""
-        ray, active = mi.Ray3f(ray), mi.Bool(active)
-        return camera_radiance(scene, transport, sampler, ray, active, self.secondary_samples)
 
 
 class GatheringIntegrator(CachedIntegrator):
@@ -313,6 +262,46 @@ class GatheringIntegrator(CachedIntegrator):
         self.irradiance_filter = parameters.flag("irradiance_filter", True)
         self.indirect_aovs = parameters.flag("indirect_aovs", False)
         self.clamp_indirect = parameters.number("clamp_indirect", 0.0, 0.0)
+
+    def rules(self, seed):
+        residual = None
+        if self.residual_probability > 0:
+            residual = Residual(
+                dr.opaque(mi.Float, self.residual_probability),
+                dr.opaque(mi.UInt32, (seed + 1) & 0xFFFFFFFF),
+            )
+        return PathRules(
+            gather_depth=1,
+            secondary_samples=self.secondary_samples,
+            shadow_samples=self.shadow_samples,
+            hide_emitters=self.hide_emitters,
+            residual=residual,
+            clamp=dr.opaque(mi.Float, self.clamp_indirect) if self.clamp_indirect else None,
+        )
+
+    def expose(self, sensor, sampler, spp, seed, shade):
+        shared = self.irradiance_filter and self.residual_probability == 0
+        if not (shared or self.indirect_aovs):
+            return super().expose(sensor, sampler, spp, seed, shade)
+        n_shared = spp * self.secondary_samples if shared else 0
+        expose_gathered(sensor, sampler, spp, seed, shade, n_shared, self.indirect_aovs)
+
+    def aov_names(self):
+        return list(INDIRECT_AOVS) if self.indirect_aovs else []
+
+    def aovs(self, found):
+        if not self.indirect_aovs:
+            return []
+        gathered = found.gathered
+        return [c for x in (gathered.radiance, gathered.radiance, gathered.albedo) for c in rgb(x)]
+
+
+def _serves(state: BakedState, scene: mi.Scene, now: SceneState, view: mi.Sensor | None) -> bool:
+    if view is None or view_name(view) in state.views:
+        return True
+    with dr.suspend_grad():
+        found = service(scene, now.ids, state.cache.patches, view)
+    return found.suffices(state.service)
 
 
 def _camera_samples(sensor: mi.Sensor | None, spp: int) -> int:

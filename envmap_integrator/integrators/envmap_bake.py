@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..system.parameters import Parameters
-from ..transport.path import as_baked
+from ..transport.rules import as_baked
 from .base import CachedIntegrator
 
 
@@ -59,8 +59,8 @@ class EnvmapBake(CachedIntegrator):
         super().__init__(props)
         self.samples = Parameters(props).power_of_two("samples", 8, 1, 1 << 12)
 
-    def transport(self, scene, prepared, spp):
-        return as_baked(self.transport_from(scene, prepared), self.shadow_samples)
+    def rules(self, seed):
+        return as_baked(self.shadow_samples)
 
     def aov_names(self):
         return ["distance"]

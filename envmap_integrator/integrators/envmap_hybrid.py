@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mitsuba as mi
 
 from ..emitters.mipmap_cube import MipmapCube
 from ..lookup.cube_map import MAX_RESOLUTION
-from ..lookup.far_field import FarField, far_field
+from ..lookup.far_field import far_field
 from ..system.parameters import Parameters
 from .base import GatheringIntegrator
 from .envmap_bake import EnvmapBake
@@ -163,30 +165,26 @@ class EnvmapHybrid(GatheringIntegrator):
             requests=self.requests,
         )
 
-    def transport(self, scene, prepared, spp):
-        return self.transport_from(
-            scene,
-            prepared,
-            far_field=self._far_field_of(scene, prepared, spp),
+    def rules(self, seed):
+        return replace(
+            super().rules(seed),
             gather_depth=self.gather_depth,
             shadow_rays=self.second_hit == "shadow_rays",
-            hide_emitters=self.hide_emitters,
-            residual=self.residual(),
         )
 
-    def _far_field_of(self, scene, prepared, spp) -> FarField | None:
-        """The maps where kernels read them, uploaded once for a prepared state and sample count."""
-        if not prepared.maps:
+    def far_field(self, scene, baked, spp):
+        """Uploaded once for a baked state and sample count."""
+        if not baked.maps:
             return None
-        held = self.objects_of(scene), prepared
-        numbers = spp * self.secondary_samples, self.mip_bias, self.lookup, self.mirrors
-        key = (*map(id, held), *numbers)
+        held = self._scenes(scene), baked
+        n_samples = spp * self.secondary_samples
+        key = (*map(id, held), n_samples, self.mip_bias, self.lookup, self.mirrors)
         if self._far_field is None or self._far_field[0] != key:
             found = far_field(
                 scene,
-                prepared.maps,
-                prepared.cluster_of_cell,
-                spp * self.secondary_samples,
+                baked.maps,
+                baked.cluster_of_cell,
+                n_samples,
                 self.mip_bias,
                 corrected=self.lookup == "corrected",
                 map_mirrors=self.mirrors == "map",

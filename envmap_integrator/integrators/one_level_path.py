@@ -58,12 +58,3 @@ class OneLevelPath(GatheringIntegrator):
        - |bool|
        - Hide directly visible emitters. (Default: false)
     """
-
-    def transport(self, scene, prepared, spp):
-        return self.transport_from(
-            scene,
-            prepared,
-            gather_depth=1,
-            hide_emitters=self.hide_emitters,
-            residual=self.residual(),
-        )

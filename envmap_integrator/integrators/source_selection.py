@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from ..transport.rules import PathRules
 from .base import CachedIntegrator
 
 
@@ -41,10 +42,7 @@ class SourceSelection(CachedIntegrator):
     LEAST_PATCH_SAMPLES = 128
     """The cache is looked at directly, and its noise with it."""
 
-    def transport(self, scene, prepared, spp):
-        return self.transport_from(
-            scene,
-            prepared,
-            gather_depth=0,
-            hide_emitters=self.hide_emitters,
+    def rules(self, seed):
+        return PathRules(
+            gather_depth=0, shadow_samples=self.shadow_samples, hide_emitters=self.hide_emitters
         )

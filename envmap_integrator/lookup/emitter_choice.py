@@ -46,7 +46,7 @@ class Emitters:
 
 
 @dataclass(frozen=True)
-class SourceChoice:
+class EmitterChoice:
     """Probabilities of the emitters in each large cell of the coarse mesh, and anywhere else.
 
     emitters      the L emitters to choose from

@@ -50,7 +50,7 @@ class FarField:
     mip_bias           [1]       levels added to the look-up
     map_mirrors        whether mirrors and narrow lobes read the map too (else traced)
     corrected          whether look-ups use the distance (else where the ray leaves the cube)
-    sources            scene of the emitters' shapes alone, for the mirrors that read the map
+    emitter_scene      scene of the emitters' shapes alone, for the mirrors that read the map
     has_environment    whether the scene has an environment emitter
     """
 
@@ -63,7 +63,7 @@ class FarField:
     mip_bias: mi.Float
     corrected: bool
     map_mirrors: bool
-    sources: mi.Scene | None
+    emitter_scene: mi.Scene | None
     has_environment: bool
 
     def cube(self, cell, p, active):
@@ -140,14 +140,14 @@ class FarField:
         n_channels = len(mi.Spectrum())
         return mi.Spectrum(*(value[i] for i in range(n_channels))), trusted
 
-    def intersect_sources(self, scene, ray, active):
-        """Find the source that a ray beyond its cube reaches, if any.
+    def intersect_emitters(self, scene, ray, active):
+        """Find the emitter that a ray beyond its cube reaches, if any.
 
         Cheap and exact: the ray meets a scene of emitters only, and visibility is tested where it
         hits one. Returns a surface interaction (invalid for the environment) and its visibility.
         """
         count(Ray.SOURCE, ray, active)
-        si = self.sources.ray_intersect(ray, active)
+        si = self.emitter_scene.ray_intersect(ray, active)
         found = active & (si.is_valid() | self.has_environment)
         ray = mi.Ray3f(ray)
         ray.maxt = dr.select(si.is_valid(), si.t * (1 - 1e-4), dr.largest(mi.Float))
@@ -187,23 +187,23 @@ def far_field(
         mip_bias=dr.opaque(mi.Float, mip_bias),
         corrected=corrected,
         map_mirrors=map_mirrors,
-        sources=_source_scene(scene) if map_mirrors else None,
+        emitter_scene=_emitter_scene(scene) if map_mirrors else None,
         has_environment=scene.environment() is not None,
     )
 
 
-def _source_scene(scene: mi.Scene) -> mi.Scene:
+def _emitter_scene(scene: mi.Scene) -> mi.Scene:
     """A scene of the emitters' shapes alone."""
     shapes = [shape for shape in scene.shapes() if shape.is_emitter()]
     # An empty scene can't be traced; a shape out of reach stands for it.
     nowhere = {"type": "sphere", "center": [1e12, 1e12, 1e12]}
     ids = [shape.id() for shape in shapes]
-    sources = mi.load_dict(
+    emitters = mi.load_dict(
         {"type": "scene", "nowhere": nowhere} | {f"shape{i}": s for i, s in enumerate(shapes)}
     )
     for shape, id_ in zip(shapes, ids, strict=True):  # Loading has renamed them.
         shape.set_id(id_)
-    return sources
+    return emitters
 
 
 def texel_type():

@@ -101,8 +101,8 @@ class BakedState:
 
     key                what it belongs to
     cache              irradiance on the patches
-    sources            [R * L * 4]  probabilities of the emitters (``SourceChoice.table``),
-    source_rows        [C]          ... and which row is each large cell's
+    emitter_table      [R * L * 4]  probabilities of the emitters (``EmitterChoice.table``),
+    emitter_rows       [C]          ... and which row is each large cell's
     views              names (``view_name``) of the sensors that it was made for,
     service            ... and what the coarse mesh does for them
     relative_error     [1]          error of the brightness of their pictures, of the worst, that
@@ -114,8 +114,8 @@ class BakedState:
 
     key: StateKey
     cache: IrradianceCache
-    sources: mi.Float
-    source_rows: mi.UInt32
+    emitter_table: mi.Float
+    emitter_rows: mi.UInt32
     views: tuple[str, ...]
     service: Service
     relative_error: float
@@ -141,8 +141,8 @@ def save(path, prepared: BakedState) -> None:
         "patches": {"fingerprint": _image(patches.cells.numpy())},
         "levels": {"entry": _image(patches.levels.numpy())},
         "irradiance": {"Y": _image(prepared.cache.table.numpy())},
-        "sources": {"alias": _image(prepared.sources.numpy())},
-        "source_rows": {"row": _image(prepared.source_rows.numpy())},
+        "sources": {"alias": _image(prepared.emitter_table.numpy())},
+        "emitter_rows": {"row": _image(prepared.emitter_rows.numpy())},
     }
     if prepared.cluster_of_cell is not None:
         parts["cluster_of_cell"] = {"cluster": _image(prepared.cluster_of_cell)}
@@ -160,8 +160,8 @@ def save(path, prepared: BakedState) -> None:
         "patches": patches.count,
         "use_objects": patches.use_objects,
         "channels": len(mi.Spectrum()),
-        "sources": dr.width(prepared.sources),
-        "source_rows": dr.width(prepared.source_rows),
+        "sources": dr.width(prepared.emitter_table),
+        "emitter_rows": dr.width(prepared.emitter_rows),
         "views": list(prepared.views),
         "service": [asdict(prepared.service)],
         "relative_error": prepared.relative_error,
@@ -210,7 +210,7 @@ def _prepared(stored: Stored, key: StateKey, n_emitters: int) -> BakedState:
     # What kernels look up has to be there: they don't check.
     n_sources = stored.integer("sources", 4 * n_emitters)
     sources = values("sources", "alias", np.float32, n_sources)
-    rows = values("source_rows", "row", np.uint32, stored.integer("source_rows", 1))
+    rows = values("emitter_rows", "row", np.uint32, stored.integer("emitter_rows", 1))
     other = sources[1::4]
     n_rows = n_sources // (4 * n_emitters)
     if rows.max() >= n_rows or not np.all((other >= 0) & (other < n_emitters)):

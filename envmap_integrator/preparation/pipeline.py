@@ -11,11 +11,10 @@ import mitsuba as mi
 import numpy as np
 
 from ..lookup.cube_map import CubeMap
-from ..lookup.emitter_choice import Emitters
-from ..lookup.ids import ObjectIds
+from ..lookup.lookup import Lookup
 from ..system.memory import check_memory
 from ..transport.camera import camera_radiance
-from ..transport.path import Transport, as_baked
+from ..transport.rules import as_baked
 from .baked_state import BakedState, Settings, StateKey
 from .coarse_mesh.build import build_mesh
 from .coarse_mesh.patch_points import only_standing
@@ -24,9 +23,10 @@ from .coarse_mesh.surface_points import scatter_points
 from .coarse_mesh.views import usual_service, view_name
 from .maps.bake import bake_maps
 from .maps.clusters import cluster_of_cell, find_clusters, listed_clusters, worthwhile
-from .radiosity.direct_light import choose_sources, survey_direct_light
+from .radiosity.direct_light import choose_emitters, survey_direct_light
 from .radiosity.evenness import sort_out_uneven
 from .radiosity.irradiance import solve_irradiance
+from .scene_state import SceneState
 
 #: How often patches that turn out to be too large are halved.
 MOST_DIVISIONS = 2
@@ -38,12 +38,17 @@ PATCH_MEMORY, RAY_MEMORY, TEXEL_MEMORY = 10000, 40, 130
 
 
 def prepare(
-    scene: mi.Scene, key: StateKey, settings: Settings, sensors: list[mi.Sensor], owner: str
+    scene: mi.Scene,
+    state: SceneState,
+    asked: Settings,
+    settings: Settings,
+    sensors: list[mi.Sensor],
+    owner: str,
 ) -> BakedState:
     """Run the pre-passes for the views of some sensors.
 
-    ``settings`` are those of the key ``for_render``. Raises ``ValueError``, in the name of
-    ``owner``, if there is too little memory for them.
+    ``state`` is that of the scene; ``settings`` are those ``asked`` for, ``for_render``. Raises
+    ``ValueError``, in the name of ``owner``, if there is too little memory for them.
     """
     check_memory(
         owner,
@@ -55,26 +60,25 @@ def prepare(
     times: dict[str, float] = {}
 
     with _timed(times, "coarse mesh"):
-        object_ids, emitters = ObjectIds(scene), Emitters(scene)
         points = scatter_points(
-            scene, object_ids, POINTS_PER_PATCH * settings.patches, sensors, settings.map_mirrors
+            scene, state.ids, POINTS_PER_PATCH * settings.patches, sensors, settings.map_mirrors
         )
     divided = None
     for divisions in range(MOST_DIVISIONS + 1):
         with _timed(times, "coarse mesh"):
-            mesh = only_standing(build_mesh(points, object_ids, settings.patches, divided))
-            mesh = separate(scene, object_ids, find_spaces(scene, mesh))
+            mesh = only_standing(build_mesh(points, state.ids, settings.patches, divided))
+            mesh = separate(scene, state.ids, find_spaces(scene, mesh))
 
         with _timed(times, "direct light"):
-            light = survey_direct_light(scene, emitters, mesh)
-            sources = choose_sources(emitters, light, mesh)
+            light = survey_direct_light(scene, state.emitters, mesh)
+            choice = choose_emitters(state.emitters, light, mesh)
             mesh = sort_out_uneven(light, mesh)
 
         with _timed(times, "irradiance cache"):
-            transport = Transport(mesh.patches, object_ids, sources)
+            lookup = Lookup(mesh.patches, state.ids, choice)
             solution = solve_irradiance(
                 scene,
-                transport,
+                lookup,
                 mesh,
                 settings.patch_samples,
                 settings.more_rays,
@@ -91,13 +95,13 @@ def prepare(
             membership = cluster_of_cell(len(clusters), cluster_of_point, mesh)
         with _timed(times, "maps"):
             members = [points.take(cluster_of_point == i) for i in range(len(clusters))]
-            cached = replace(transport, cache=solution.cache)
-            maps = _baked(scene, cached, clusters, members, settings, owner)
+            lookup = replace(lookup, cache=solution.cache)
+            maps = _baked(scene, lookup, clusters, members, settings, owner)
     return BakedState(
-        key,
+        StateKey(state.fingerprint, asked),
         solution.cache,
-        sources.table,
-        sources.row_of_cell,
+        choice.table,
+        choice.row_of_cell,
         tuple(map(view_name, sensors)),
         usual_service(mesh),
         solution.relative_error,
@@ -123,7 +127,7 @@ def _clusters(scene, mesh, solution, settings):
     return found
 
 
-def _baked(scene, transport, clusters, members, settings, owner) -> tuple[CubeMap, ...]:
+def _baked(scene, lookup, clusters, members, settings, owner) -> tuple[CubeMap, ...]:
     resolution = settings.map_resolution
     check_memory(
         owner,
@@ -131,10 +135,10 @@ def _baked(scene, transport, clusters, members, settings, owner) -> tuple[CubeMa
         len(clusters) * 6 * resolution**2 * TEXEL_MEMORY,
         'lower "map_resolution" or list fewer clusters',
     )
-    seen = as_baked(transport, settings.map_shadow_samples)
+    rules = as_baked(settings.map_shadow_samples)
 
     def radiance_distance(sampler, ray, active):
-        found = camera_radiance(scene, seen, sampler, ray, active, secondary_samples=0)
+        found = camera_radiance(scene, lookup, rules, sampler, ray, active)
         return found.radiance, found.distance
 
     return bake_maps(

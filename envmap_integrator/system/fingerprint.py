@@ -70,7 +70,10 @@ class SceneFingerprint:
         self._hash = ""
 
     def __call__(self, scene: mi.Scene) -> str:
-        content = SceneContent(scene)
+        return self.of(SceneContent(scene))
+
+    def of(self, content: SceneContent) -> str:
+        """The same of a scene whose content has been listed."""
         if content != self._content:
             # Arrays that are still there needn't be read again.
             digests = _Digests(self._digests.arrays if self._digests else {})

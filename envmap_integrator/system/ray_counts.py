@@ -64,9 +64,8 @@ def count(kind: Ray, ray: mi.Ray3f | mi.DirectionSample3f, active: mi.Bool) -> N
         dr.scatter_add(_counter, mi.UInt64(1), mi.UInt32(int(kind)), lanes, dr.ReduceMode.Local)
 
 
-def count_secondary(ray: mi.Ray3f, bounded: mi.Bool, retraced: mi.Bool, active: mi.Bool) -> None:
-    """Count the active lanes' rays, each under its own kind; ``retraced`` ones aren't bounded."""
+def count_secondary(ray: mi.Ray3f, bounded: mi.Bool, active: mi.Bool) -> None:
+    """Count the active lanes' rays, each under its own kind."""
     if _counter is not None:
         count(Ray.SECONDARY, ray, active & bounded)
-        count(Ray.UNBOUNDED, ray, active & ~bounded & ~retraced)
-        count(Ray.RETRACED, ray, active & retraced)
+        count(Ray.UNBOUNDED, ray, active & ~bounded)

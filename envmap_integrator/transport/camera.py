@@ -7,24 +7,16 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from ..lookup.lookup import Lookup
 from ..system.jit import opaque_point
 from ..system.ray_counts import Ray, count
+from .direct_light import WideShare, sample_emitter, sample_emitters
 from .gathered import Gathered
-from .path import (
-    PathState,
-    Transport,
-    Vertex,
-    camera_path,
-    facing,
-    follow,
-    is_delta,
-    is_diffuse,
-    is_wide,
-    sample_sources,
-    single_lobe,
-    skip_sources,
-    survival_probability,
-)
+from .lobes import Scattered, is_delta, is_diffuse, single_lobe
+from .path import follow, survival_probability
+from .rules import PathRules
+from .state import PathStart, camera_path
+from .vertex import Vertex, skip_emitters
 
 #: Added to the albedo of what has gloss beside its diffuse lobe: the wide part of gloss is light
 #: that the surface reflects however dark it is.
@@ -62,24 +54,24 @@ class CameraSample:
 
 def camera_radiance(
     scene: mi.Scene,
-    transport: Transport,
+    lookup: Lookup,
+    rules: PathRules,
     sampler: mi.Sampler,
     ray: mi.Ray3f,
     active: mi.Bool,
-    secondary_samples: int,
 ) -> CameraSample:
     """What rays of a sensor or a texel find.
 
     Where the cache may end a path at once (``gather_depth`` 0) there are no secondary rays.
     """
-    if transport.gather_depth == 0:
-        end = follow(scene, transport, sampler, camera_path(ray), active)
+    if rules.gather_depth == 0:
+        end = follow(scene, lookup, rules, sampler, camera_path(ray), active)
         return CameraSample(end.radiance, end.distance, end.valid).finite()
-    return split(scene, transport, sampler, ray, active, secondary_samples).finite()
+    return split(scene, lookup, rules, sampler, ray, active).finite()
 
 
 @dr.syntax
-def split(scene, transport, sampler, ray, active, secondary_samples):
+def split(scene, lookup, rules, sampler, ray, active) -> CameraSample:
     """Shade the first surface that isn't a mirror or glass, and send secondary rays from it.
 
     This vertex stands outside the loop over the others also for a single secondary ray: it needs no
@@ -89,14 +81,14 @@ def split(scene, transport, sampler, ray, active, secondary_samples):
 
     count(Ray.PRIMARY, ray, active)
     pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-    if dr.hint(transport.hide_emitters, mode="scalar"):
-        pi = skip_sources(scene, ray, pi, active)
+    if dr.hint(rules.hide_emitters, mode="scalar"):
+        pi = skip_emitters(scene, ray, pi, active)
     si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
     distance = dr.select(active & si.is_valid(), si.t, dr.inf)
-    shown = active & (not transport.hide_emitters)
+    shown = active & (not rules.hide_emitters)
     valid = shown & (scene.environment() is not None)
     throughput, on_mirrors = mi.Spectrum(1), mi.Spectrum(0)
-    if dr.hint(transport.far_field is None or not transport.far_field.map_mirrors, mode="scalar"):
+    if dr.hint(lookup.far_field is None or not lookup.far_field.map_mirrors, mode="scalar"):
         mirrored = active & si.is_valid() & is_delta(si.bsdf(ray))
         si, ray, throughput, on_mirrors, solid = follow_mirrors(scene, sampler, si, ray, mirrored)
         shown |= solid | (mirrored & si.is_valid())
@@ -105,50 +97,42 @@ def split(scene, transport, sampler, ray, active, secondary_samples):
     # ---------------------- First vertex ----------------------
 
     active &= dr.max(throughput) > 0
-    hit = active & si.is_valid()
-    bsdf = si.bsdf(ray)
-    smooth = hit & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-    cube, mapped = None, smooth
-    if dr.hint(transport.far_field is not None and transport.far_field.map_mirrors, mode="scalar"):
-        mapped = hit
-    object_id = transport.object_ids(si)
-    cell, _, found = transport.patches.find_cell(si.p, facing(si, ray), object_id, mapped)
-    if dr.hint(transport.far_field is not None, mode="scalar"):
-        cube = transport.far_field.cube(cell, si.p, found)
-    sources = transport.sources
-    source_row = sources.row(cell, found)
-    no = mi.Bool(False)
-    vertex = Vertex(si, bsdf, sources, source_row, no, no, cube, mi.Float(1))
-
-    emitted = si.emitter(scene).eval(si, active & shown)
-    n_shadow = transport.shadow_samples
-    radiance = emitted + sample_sources(
-        scene, vertex, sampler, mi.UInt32(n_shadow), n_shadow > 1, smooth
-    )
+    vertex = Vertex.met(lookup, si, ray, active)
+    radiance = si.emitter(scene).eval(si, active & shown)
+    if dr.hint(rules.shadow_samples > 1, mode="scalar"):
+        n = mi.UInt32(rules.shadow_samples)
+        radiance += sample_emitters(
+            scene, lookup.emitters, vertex, WideShare(), sampler, n, vertex.smooth
+        )
+    else:
+        u = sampler.next_2d()
+        radiance += sample_emitter(scene, lookup.emitters, vertex, WideShare(), u, vertex.smooth)
 
     # ---------------------- Secondary rays ----------------------
 
-    if dr.hint(secondary_samples == 1, mode="scalar"):
+    if dr.hint(rules.secondary_samples == 1, mode="scalar"):
         u = sampler.next_1d()
-        arriving, wide, nearness, solid = secondary(scene, transport, sampler, vertex, u, hit)
+        arriving, wide, nearness, solid = secondary(
+            scene, lookup, rules, sampler, vertex, u, vertex.hit
+        )
         valid |= solid
     else:
         i = mi.UInt32(0)
         arriving, wide, nearness = mi.Spectrum(0), mi.Spectrum(0), mi.Float(0)
-        pending = mi.Bool(hit)
-        while dr.hint(pending, exclude=[transport, vertex], label="Secondary rays"):
-            u = (mi.Float(i) + sampler.next_1d()) / mi.Float(secondary_samples)
-            one = secondary(scene, transport, sampler, vertex, u, pending)
+        pending = mi.Bool(vertex.hit)
+        while dr.hint(pending, exclude=[lookup, rules, vertex], label="Secondary rays"):
+            u = (mi.Float(i) + sampler.next_1d()) / mi.Float(rules.secondary_samples)
+            one = secondary(scene, lookup, rules, sampler, vertex, u, pending)
             arriving += one[0]
             wide += one[1]
             nearness += one[2]
             valid |= pending & one[3]
             i += 1
-            pending &= i < secondary_samples
-        arriving /= secondary_samples
-        wide /= secondary_samples
-        nearness /= secondary_samples
-    gathered = gathering(scene, si, bsdf, wide, nearness, smooth)
+            pending &= i < rules.secondary_samples
+        arriving /= rules.secondary_samples
+        wide /= rules.secondary_samples
+        nearness /= rules.secondary_samples
+    gathered = gathering(scene, si, vertex.bsdf, wide, nearness, vertex.smooth)
     seen = CameraSample(radiance + arriving, distance, valid, gathered).scaled(throughput)
     return replace(seen, radiance=seen.radiance + on_mirrors)
 
@@ -193,37 +177,44 @@ def gathering(scene, si, bsdf, radiance, nearness, active) -> Gathered:
     return found.where(shared)
 
 
-def secondary(scene, transport, sampler, vertex, u, active):
+def secondary(
+    scene: mi.Scene,
+    lookup: Lookup,
+    rules: PathRules,
+    sampler: mi.Sampler,
+    vertex: Vertex,
+    u: mi.Float,
+    active: mi.Bool,
+) -> tuple[mi.Spectrum, mi.Spectrum, mi.Float, mi.Bool]:
     """One secondary ray.
 
     Returns the radiance [W/m²/sr] that it brings, the part of it by wide lobes, the inverse
     distance [1/m] to where they were traced, and whether anything was solid.
     """
     si = vertex.si
-    bs, weight = vertex.bsdf.sample(mi.BSDFContext(), si, u, sampler.next_2d(), active)
-    specular = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-    wide = is_wide(si, bs.wo, bs.pdf) & ~specular
-    start = PathState(
+    scattered = Scattered.of(
+        si, *vertex.bsdf.sample(mi.BSDFContext(), si, u, sampler.next_2d(), active)
+    )
+    bs, wide = scattered.bs, scattered.wide
+    start = PathStart(
         ray=si.spawn_ray(si.to_world(bs.wo)),
-        depth=dr.select(specular, mi.UInt32(0), mi.UInt32(1)),
+        depth=dr.select(scattered.specular, mi.UInt32(0), mi.UInt32(1)),
         origin=mi.Interaction3f(si),
-        source_row=vertex.source_row,
+        emitter_row=vertex.emitter_row,
         pdf=bs.pdf,
-        specular=specular,
-        bounded=mi.Bool(False),
-        cluster=mi.UInt32(0),
-        reach=mi.Float(dr.inf),
+        specular=scattered.specular,
         solid=active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null),
     )
     if vertex.cube is not None:
         start.cluster = vertex.cube.cluster
-        start.bounded, start.ray.maxt, start.reach = transport.far_field.bound(
+        start.bounded, start.ray.maxt, start.reach = lookup.far_field.bound(
             vertex.cube, start.ray, wide, sampler.next_1d(), active
         )
-    end = follow(scene, transport, sampler, start, active & (dr.max(weight) > 0))
-    arriving = weight * end.radiance
-    if transport.clamp is not None:
+    going = active & (dr.max(scattered.weight) > 0)
+    end = follow(scene, lookup, rules, sampler, start, going)
+    arriving = scattered.weight * end.radiance
+    if rules.clamp is not None:
         largest = dr.max(dr.abs(arriving))
-        arriving *= dr.select(largest > transport.clamp, transport.clamp / largest, 1)
+        arriving *= dr.select(largest > rules.clamp, rules.clamp / largest, 1)
     nearness = dr.rcp(dr.minimum(end.distance, start.ray.maxt))
     return arriving, dr.select(wide, arriving, 0), dr.select(wide, nearness, 0), end.valid

@@ -191,8 +191,8 @@ def test_replaced_approximations_are_put_back():
     """Outside their contexts nothing is replaced, not even after an error."""
 
     def replaceable():
-        far_field, transport = variants.FarField, variants.transport
-        return far_field.eval, far_field._inverse_distance, variants.Patches.find, transport.is_wide
+        far_field, lobes = variants.FarField, variants.lobes
+        return far_field.eval, far_field._inverse_distance, variants.Patches.find, lobes.is_wide
 
     before = replaceable()
     for variant in variants.variants(patches=256, finer=4).values():

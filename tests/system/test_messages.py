@@ -275,7 +275,7 @@ def half_map(parts: dict, metadata: dict) -> None:
 
 
 def wrong_rows(parts: dict, metadata: dict) -> None:
-    parts["source_rows"]["row"][:] = 10**6
+    parts["emitter_rows"]["row"][:] = 10**6
 
 
 def no_maps(parts: dict, metadata: dict) -> None:

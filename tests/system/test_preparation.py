@@ -132,7 +132,7 @@ def test_scenes_merged_in_another_order_are_prepared_alike():
     first, *others = prepared
     for other in others:
         assert other.key == first.key
-        assert np.array_equal(other.sources.numpy(), first.sources.numpy())
+        assert np.array_equal(other.emitter_table.numpy(), first.emitter_table.numpy())
         assert np.array_equal(other.cache.table.numpy(), first.cache.table.numpy())
 
 

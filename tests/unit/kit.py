@@ -10,11 +10,11 @@ import numpy as np
 from envmap_integrator.lookup.emitter_choice import Emitters
 from envmap_integrator.lookup.ids import ObjectIds
 from envmap_integrator.lookup.irradiance_cache import IrradianceCache
+from envmap_integrator.lookup.lookup import Lookup
 from envmap_integrator.preparation.coarse_mesh import build
 from envmap_integrator.preparation.coarse_mesh.surface_points import SurfacePoints, scatter_points
 from envmap_integrator.preparation.radiosity.alias_tables import by_weight
 from envmap_integrator.preparation.radiosity.irradiance import Solution, solve_irradiance
-from envmap_integrator.transport.path import Transport
 from tests.helpers import Estimate
 
 WALL = [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]]
@@ -67,8 +67,11 @@ class CoarseMesh(build.CoarseMesh):
         return self.solution(samples).cache
 
     def solution(self, samples: int) -> Solution:
-        transport = Transport(self.patches, self.object_ids, by_weight(Emitters(self.scene)))
-        return solve_irradiance(self.scene, transport, self, samples)
+        return solve_irradiance(self.scene, self.lookup(), self, samples)
+
+    def lookup(self) -> Lookup:
+        """What paths look up while there is no cache."""
+        return Lookup(self.patches, self.object_ids, by_weight(Emitters(self.scene)))
 
 
 def coarse_mesh(scene: mi.Scene, budget: int = 1024, points_per_patch: int = 128) -> CoarseMesh:

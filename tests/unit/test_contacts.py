@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from envmap_integrator.lookup.emitter_choice import Emitters
 from envmap_integrator.lookup.irradiance_cache import IrradianceCache
-from envmap_integrator.preparation.radiosity.alias_tables import by_weight
-from envmap_integrator.transport.path import PathState, Transport, follow
+from envmap_integrator.transport.path import follow
+from envmap_integrator.transport.rules import PathRules
+from envmap_integrator.transport.state import PathStart
 from tests.helpers import box, grey
 from tests.unit.kit import coarse_mesh, scene_of, surface_points
 
@@ -27,13 +29,8 @@ def found(distance: float, primary: bool = False, n: int = 1 << 14) -> float:
     scene = scene_of(box(WALL) | grey(ALBEDO), sky={"type": "constant"})
     coarse = coarse_mesh(scene, 512, points_per_patch=64)
     table = dr.full(mi.Float, dr.pi, 2 * coarse.patches.count * len(mi.Spectrum()))
-    transport = Transport(
-        coarse.patches,
-        coarse.object_ids,
-        by_weight(Emitters(scene)),
-        gather_depth=0 if primary else 1,
-        cache=IrradianceCache(coarse.patches, table),
-    )
+    lookup = replace(coarse.lookup(), cache=IrradianceCache(coarse.patches, table))
+    rules = PathRules(gather_depth=0 if primary else 1)
     place = surface_points(np.array([[0.01, 0.02, -WALL]]), [0, 0, 1])
     size = float(coarse.find(place)[1][0])
 
@@ -41,19 +38,16 @@ def found(distance: float, primary: bool = False, n: int = 1 << 14) -> float:
     sampler.seed(0, n)
     origin = dr.zeros(mi.Interaction3f, n)
     origin.p = mi.Point3f(0.01, 0.02, -WALL + distance * size)
-    start = PathState(
+    start = PathStart(
         ray=mi.Ray3f(origin.p, mi.Vector3f(0, 0, -1)),
         depth=mi.UInt32(0 if primary else 1),
         origin=origin,
-        source_row=mi.UInt32(0),
+        emitter_row=mi.UInt32(0),
         pdf=mi.Float(dr.inv_pi),
         specular=mi.Bool(primary),
-        bounded=mi.Bool(False),
-        cluster=mi.UInt32(0),
-        reach=mi.Float(dr.inf),
         primary=primary,
     )
-    end = follow(scene, transport, sampler, start, dr.full(mi.Bool, True, n))
+    end = follow(scene, lookup, rules, sampler, start, dr.full(mi.Bool, True, n))
     return float(end.radiance.numpy().mean())
 
 

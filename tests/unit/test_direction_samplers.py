@@ -16,13 +16,11 @@ from scipy import stats
 
 from envmap_integrator.lookup.cube import direction_to_face
 from envmap_integrator.lookup.cube_map import Cluster
-from envmap_integrator.lookup.emitter_choice import Emitters
 from envmap_integrator.preparation.coarse_mesh.surface_points import _global_lines
 from envmap_integrator.preparation.maps.bake import bake_maps
 from envmap_integrator.preparation.radiosity import gather, irradiance
-from envmap_integrator.preparation.radiosity.alias_tables import by_weight
 from envmap_integrator.system.jit import SpareNumbers
-from envmap_integrator.transport import path as transport
+from envmap_integrator.transport import state
 from tests.helpers import ball, grey
 from tests.unit.kit import coarse_mesh, scene_of, surface_points
 
@@ -121,12 +119,12 @@ def gathered(monkeypatch):
     """First rays of a gathering over a tilted plate: direction [P, SAMPLES, 3] and density."""
     seen = []
 
-    def follow(scene, transport_, sampler, start, active):
+    def follow(scene, lookup, rules, sampler, start, active):
         assert active.numpy().mean() > 0.999  # Rounding may take a ray below the surface.
         seen.append((start.ray.d.numpy().T, start.pdf.numpy()))
         black = dr.zeros(mi.Spectrum, dr.width(start.ray))
         row = dr.zeros(mi.UInt32, dr.width(start.ray))
-        return transport.PathEnd(black, black, black, row, row, mi.Bool(False), mi.Float(dr.inf))
+        return state.PathEnd(black, black, black, row, row, mi.Bool(False), mi.Float(dr.inf))
 
     monkeypatch.setattr(gather, "follow", follow)
     turned = mi.ScalarTransform4f().look_at([0, 0, 0], NORMAL.tolist(), [0, 0, 1])
@@ -134,12 +132,10 @@ def gathered(monkeypatch):
     coarse = coarse_mesh(scene_of(plate), budget=4096, points_per_patch=32)
     upper = coarse.points.normal @ NORMAL > 0
     coarse = replace(coarse, patch_of_point=np.where(upper, coarse.patch_of_point, -1))
-    sources = by_weight(Emitters(coarse.scene))
-    tools = transport.Transport(coarse.patches, coarse.object_ids, sources)
     for seed in range(16):
         irradiance.solve_irradiance(
             coarse.scene,
-            tools,
+            coarse.lookup(),
             coarse,
             SAMPLES,
             seed=seed << 16,

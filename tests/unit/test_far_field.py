@@ -248,7 +248,7 @@ def test_mirrors_may_read_the_map_and_count_all_sources(random):
 def reached(scene: mi.Scene, towards) -> tuple[mi.SurfaceInteraction3f, bool]:
     field = field_of(constant_levels(1, 1, 1, 0), scene, mirrors=True)
     ray = mi.Ray3f(mi.Point3f(0, 0, 0), mi.Vector3f(*map(float, towards)))
-    si, found = field.intersect_sources(scene, ray, mi.Bool(True))
+    si, found = field.intersect_emitters(scene, ray, mi.Bool(True))
     dr.eval(si, found)  # While the scene of the sources is there.
     return si, bool(found.numpy().any())
 

@@ -9,14 +9,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from envmap_integrator.lookup.emitter_choice import Emitters
 from envmap_integrator.preparation.coarse_mesh.patch_points import PatchPoints
-from envmap_integrator.preparation.radiosity.alias_tables import by_weight
 from envmap_integrator.preparation.radiosity.coarseness import Coarseness
 from envmap_integrator.preparation.radiosity.gather import block_mean, gather
 from envmap_integrator.preparation.radiosity.irradiance import solve_irradiance
 from envmap_integrator.preparation.radiosity.noise import TARGET, Noise
-from envmap_integrator.transport.path import Transport
 from tests.helpers import Description, at, box, camera, emitting, grey, load, room
 from tests.unit.kit import coarse_mesh
 
@@ -46,10 +43,10 @@ def solutions(scene: mi.Scene, more_rays: int = 0, count: int = 16, budget=BUDGE
     What is seen gathers light by rays of its own, always the same, which end in the cache.
     """
     coarse = coarse_mesh(scene, budget, points_per_patch=32)
-    transport = Transport(coarse.patches, coarse.object_ids, by_weight(Emitters(scene)))
+    lookup = coarse.lookup()
     members = PatchPoints(coarse)
     patches = np.arange(len(members.patches))
-    rays = gather(scene, transport, members, patches, 1024, seed=7)
+    rays = gather(scene, lookup, members, patches, 1024, seed=7)
     seen = (coarse.points.seen > 0) & (coarse.points.bounce == 0) & (coarse.patch_of_point >= 0)
     share = np.bincount(coarse.patch_of_point[seen], minlength=coarse.patches.count)
     share = share[members.patches] / share.sum()
@@ -59,7 +56,7 @@ def solutions(scene: mi.Scene, more_rays: int = 0, count: int = 16, budget=BUDGE
     for seed in range(count):
         solution = solve_irradiance(
             scene,
-            transport,
+            lookup,
             coarse,
             samples,
             more_rays,

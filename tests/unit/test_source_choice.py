@@ -9,12 +9,12 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from envmap_integrator.lookup.emitter_choice import Emitters, SourceChoice
+from envmap_integrator.lookup.emitter_choice import EmitterChoice, Emitters
 from envmap_integrator.preparation.radiosity.alias_tables import alias_tables, by_weight
 from envmap_integrator.preparation.radiosity.direct_light import (
     RAYS_PER_EMITTER,
     SAMPLES,
-    choose_sources,
+    choose_emitters,
     survey_direct_light,
 )
 from envmap_integrator.system.jit import upload
@@ -58,13 +58,13 @@ def hall_with(*lamps: dict, budget: int) -> CoarseMesh:
 
 
 @pytest.fixture(scope="module")
-def choice(hall) -> SourceChoice:
+def choice(hall) -> EmitterChoice:
     return choice_in(hall)
 
 
-def choice_in(hall) -> SourceChoice:
+def choice_in(hall) -> EmitterChoice:
     emitters = Emitters(hall.scene)
-    return choose_sources(emitters, survey_direct_light(hall.scene, emitters, hall), hall)
+    return choose_emitters(emitters, survey_direct_light(hall.scene, emitters, hall), hall)
 
 
 def on_the_floor(hall, x: float | mi.Float, n: int = 1):
@@ -194,6 +194,6 @@ def test_the_largest_random_number_is_in_the_last_bin():
     scene = scene_of(lamp_at(-1), lamp_at(1))
     si = dr.zeros(mi.SurfaceInteraction3f, 1)
     u = mi.Point2f(1 - 2**-24, 0.5)
-    choice = SourceChoice(Emitters(scene), table, mi.UInt32(0))
+    choice = EmitterChoice(Emitters(scene), table, mi.UInt32(0))
     ds, _ = choice.sample_direction(si, mi.UInt32(0), u, True)
     assert np.isfinite(ds.p.numpy()).all()

@@ -5,18 +5,18 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from ...lookup.emitter_choice import Emitters, SourceChoice
+from ...lookup.emitter_choice import EmitterChoice, Emitters
 from ...system.jit import upload
 
 
-def by_weight(emitters: Emitters) -> SourceChoice:
+def by_weight(emitters: Emitters) -> EmitterChoice:
     """A choice that knows nothing of places: one row for all cells."""
     table = upload(mi.Float, alias_tables(emitters.weights[None]))
-    return SourceChoice(emitters, table, mi.UInt32(0))
+    return EmitterChoice(emitters, table, mi.UInt32(0))
 
 
 def alias_tables(probability: np.ndarray) -> np.ndarray:
-    """Alias tables [R, L, 4] of discrete distributions [R, L] (``SourceChoice``)."""
+    """Alias tables [R, L, 4] of discrete distributions [R, L] (``EmitterChoice``)."""
     n_rows, n = probability.shape
     rows = np.arange(n_rows)
     order = np.argsort(probability, axis=1)

@@ -13,10 +13,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
+from scipy.sparse import csr_matrix
 
+from ...lookup.irradiance_cache import IrradianceCache
 from ...lookup.patches import PARTS
-from ...system.jit import mean_channel
+from ...system.jit import mean_channel, upload
 from ..coarse_mesh.patch_points import PatchPoints
 from .gather import Blocks, GatherRays
 
@@ -49,53 +53,53 @@ class Coarseness:
 def coarseness(
     rays: GatherRays,
     blocks: Blocks,
-    table: np.ndarray,
-    arriving: np.ndarray,
+    cache: IrradianceCache,
+    arriving: mi.Float,
     importance: np.ndarray,
     members: PatchPoints,
-    n_cells: int,
 ) -> Coarseness:
     """Compare what paths read with what is found where they read it.
 
-    ``table`` [2 * P] is the irradiance, ``arriving`` [N * B] what each ray brings of it from the
-    patch that it ends in, both the mean of the colour channels, and ``importance`` [K] how much the
-    picture changes with the indirect irradiance of a patch.
+    ``arriving`` [N * B] is what each ray brings of the cache's irradiance, mean of the colour
+    channels, and ``importance`` [K] how much the picture changes with the indirect irradiance of a
+    patch.
     """
-    n_patches = len(table) // 2 + 1  # The last stands for none.
-    start, place, row = (x.numpy().astype(np.int64) for x in (rays.start, rays.place, rays.row))
-    weight = mean_channel(rays.weight).numpy().astype(np.float64)
-    read = table[row]
-    indirect = rays.of_others.numpy() + arriving
-    total = indirect + rays.of_sources.numpy()
+    n_used = len(members.patches)
+    to_patch = csr_matrix((np.ones(len(rays)), (blocks.rank, np.arange(len(rays)))))
+    irradiance = cache.table.numpy().reshape(-1, len(mi.Spectrum())).mean(axis=1)
 
     # ---- Irradiance of each part of a patch, by the rays that start there ----
-    n_rays = np.bincount(start, minlength=PARTS * n_patches)
-    per_ray = 1 / np.maximum(n_rays, 1)
-    found = np.column_stack(
-        [per_ray * np.bincount(start, x, PARTS * n_patches) for x in (total, indirect)]
-    )
+    count, total, indirect = (to_patch @ sums for sums in _by_part(rays, arriving))
+    per_ray = 1 / np.maximum(count, 1)
+    found = np.stack([per_ray * total, per_ray * indirect], axis=-1)
 
     # ---- What the picture reads there, by the rays that end there ----
-    share = importance[blocks.rank] / (blocks.count[blocks.rank] * rays.samples)
-    weight *= np.repeat(share, rays.samples)
-    weight[n_rays[place] == 0] = 0  # Nothing is known of a part in which no ray starts.
-    excess = weight * (read - found[place, row & 1])
-    patch = place // PARTS
-    cell_of_patch = np.full(n_patches, -1)
-    cell_of_patch[members.patches] = members.cells
-    by_patch = np.bincount(patch, excess, n_patches)
+    largest = max(irradiance.max(), found.max(), 1e-30)
+    share = importance / (blocks.count * rays.samples)
+    ends = _Ends(rays, members.patches, cache.patches.count, count > 0)
+    weight = ends.weight(share[blocks.rank])
+    excess = weight * (
+        dr.gather(mi.Float, upload(mi.Float, irradiance), rays.row)
+        - dr.gather(mi.Float, upload(mi.Float, found), 2 * ends.slot + (rays.row & 1), ends.known)
+    )
+    # Throughputs of a block come to 1 at most, see ``gather``.
+    most = max(float(importance.sum()), 1e-30)
+    by_patch = _exact_sums(excess, ends.rank, n_used + 1, 2 * most * largest)[:-1]
 
     # ---- How sure that is: by what a ray adds to it, as one of its part and one of its patch ----
-    of_part = per_ray * np.bincount(place, weight, PARTS * n_patches)
-    of_patch = np.bincount(row >> 1, weight, n_patches) / np.maximum(
-        n_rays.reshape(-1, PARTS).sum(axis=1), 1
-    )
-    adds = (of_part[start] - of_patch[start // PARTS]) * (indirect - table[1::2][start // PARTS])
-    variance = np.bincount(start // PARTS, np.square(adds), n_patches)
+    of_part = per_ray * _exact_sums(weight, ends.slot, PARTS * (n_used + 1), most)[
+        : PARTS * n_used
+    ].reshape(-1, PARTS)
+    of_patch = _exact_sums(weight, ends.read_rank, n_used + 1, most)[:-1]
+    of_patch /= np.maximum(count.sum(axis=1), 1)
+    own = irradiance[2 * members.patches + 1]
+    squares = _squares(rays, arriving, blocks.rank, of_part - of_patch[:, None], own)
+    variance = to_patch @ squares
 
-    known = cell_of_patch >= 0
+    n_cells = dr.width(cache.patches.levels)
+    known = members.cells >= 0
     by_cell, variance = (
-        np.bincount(cell_of_patch[known], x[known], n_cells) for x in (by_patch, variance)
+        np.bincount(members.cells[known], x[known], n_cells) for x in (by_patch, variance)
     )
     steep = np.abs(by_cell) > SIGNIFICANCE * np.sqrt(variance)
     return Coarseness(
@@ -104,3 +108,91 @@ def coarseness(
         steep=steep,
         steep_bias=float(by_cell[steep].sum()),
     )
+
+
+class _Ends:
+    """Where rays end, by the rank of patches among the K that hold points; K stands for others.
+
+    rank       [N * B]  of the patch of that very place,
+    slot       [N * B]  ... PARTS * rank + its part,
+    known      [N * B]  ... and whether any ray starts in that part
+    read_rank  [N * B]  of the patch that is read there
+    """
+
+    def __init__(self, rays: GatherRays, patches: np.ndarray, n_patches: int, known: np.ndarray):
+        rank_of_patch = np.full(n_patches + 1, len(patches))
+        rank_of_patch[patches] = np.arange(len(patches))
+        rank_of_patch = upload(mi.UInt32, rank_of_patch)
+        known = np.vstack([known, np.zeros((1, PARTS), dtype=bool)])
+        self._rays = rays
+        self.rank = dr.gather(mi.UInt32, rank_of_patch, rays.place // PARTS)
+        self.slot = PARTS * self.rank + rays.place % PARTS
+        self.known = dr.gather(mi.UInt32, upload(mi.UInt32, known), self.slot) != 0
+        self.read_rank = dr.gather(mi.UInt32, rank_of_patch, rays.row >> 1)
+        dr.eval(self.rank, self.slot, self.known, self.read_rank)
+
+    def weight(self, share: np.ndarray) -> mi.Float:
+        """How much the picture hangs on what each ray reads; ``share`` [B] is that of its block.
+
+        Nothing is known of a part in which no ray starts.
+        """
+        weight = mean_channel(self._rays.weight)
+        weight *= dr.repeat(upload(mi.Float, share), self._rays.samples)
+        weight = dr.select(self.known, weight, 0)
+        dr.eval(weight)
+        return weight
+
+
+@dr.syntax
+def _by_part(rays: GatherRays, arriving: mi.Float) -> list[np.ndarray]:
+    """Sums [3, B, PARTS] over the rays of each block that start in each part of their patch.
+
+    Of their number, and of the total and the indirect irradiance that they bring.
+    """
+    first = dr.arange(mi.UInt32, len(rays)) * dr.opaque(mi.UInt32, rays.samples)
+    end = first + dr.opaque(mi.UInt32, rays.samples)
+    count = [mi.Float(0) for _ in range(PARTS)]
+    total = [mi.Float(0) for _ in range(PARTS)]
+    indirect = [mi.Float(0) for _ in range(PARTS)]
+    k = mi.UInt32(first)
+    while dr.hint(k < end, exclude=[rays, arriving], label="Parts of a patch"):
+        part = dr.gather(mi.UInt32, rays.start, k) % PARTS
+        others = dr.gather(mi.Float, rays.of_others, k) + dr.gather(mi.Float, arriving, k)
+        both = others + dr.gather(mi.Float, rays.of_emitters, k)
+        for i in range(PARTS):
+            there = part == i
+            count[i] += dr.select(there, mi.Float(1), 0)
+            total[i] += dr.select(there, both, 0)
+            indirect[i] += dr.select(there, others, 0)
+        k += 1
+    dr.eval(count, total, indirect)
+    return [np.stack([x.numpy() for x in sums], axis=1) for sums in (count, total, indirect)]
+
+
+def _squares(
+    rays: GatherRays, arriving: mi.Float, rank: np.ndarray, weight: np.ndarray, mean: np.ndarray
+) -> np.ndarray:
+    """Sums [B] over the squares of what each ray's indirect light adds to the error.
+
+    That counts by a ``weight`` [K, PARTS], and beyond the ``mean`` [K] of its patch.
+    """
+    rank = dr.repeat(upload(mi.UInt32, rank), rays.samples)
+    slot = PARTS * rank + rays.start % PARTS
+    beyond = rays.of_others + arriving - dr.gather(mi.Float, upload(mi.Float, mean), rank)
+    square = dr.square(dr.gather(mi.Float, upload(mi.Float, weight), slot) * beyond)
+    dr.eval(square)
+    return dr.block_sum(square, rays.samples).numpy().astype(np.float64)
+
+
+def _exact_sums(values: mi.Float, index: mi.UInt32, size: int, most: float) -> np.ndarray:
+    """Sums [size] of values by index, the same however threads share the work.
+
+    In integers, of which ``most`` is what all absolute values come to at most: sums of real numbers
+    depend on their order.
+    """
+    scale = 2.0 ** (60 - np.ceil(np.log2(most)))
+    number = mi.Int64(mi.Float64(values) * dr.opaque(mi.Float64, scale))
+    sums = dr.zeros(mi.UInt64, size)
+    dr.scatter_add(sums, mi.UInt64(number), index, mode=dr.ReduceMode.Direct)
+    dr.eval(sums)
+    return sums.numpy().view(np.int64) / scale

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...lookup.emitter_choice import Emitters, SourceChoice
+from ...lookup.emitter_choice import EmitterChoice, Emitters
 from ...lookup.patches import normal_direction
 from ...system.jit import mean_channel, upload, upload_vectors
 from ...system.ray_counts import Ray, count
@@ -68,11 +68,11 @@ def survey_direct_light(
     return DirectLight(members, irradiance, emitter, si.p)
 
 
-def choose_sources(
+def choose_emitters(
     emitters: Emitters,
     light: DirectLight,
     mesh: CoarseMesh,
-) -> SourceChoice:
+) -> EmitterChoice:
     """Probabilities of the emitters in each large cell, by the light found of them there.
 
     In proportion to the root mean square: to the mean, near lamps would get too few shadow rays.
@@ -130,7 +130,7 @@ def choose_sources(
     found /= found.sum(axis=1, keepdims=True)
     probability = (1 - UNINFORMED) * found + UNINFORMED * weights
     table = upload(mi.Float, alias_tables(probability))
-    return SourceChoice(emitters, table, upload(mi.UInt32, row_of_cell))
+    return EmitterChoice(emitters, table, upload(mi.UInt32, row_of_cell))
 
 
 def _surroundings(mesh: CoarseMesh, index: np.ndarray):

@@ -12,10 +12,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...lookup.lookup import Lookup
 from ...lookup.patches import PARTS
 from ...system.jit import mean_channel, mix, unit, upload
 from ...system.progress import stage
-from ...transport.path import PathState, Transport, follow, mis_weight
+from ...transport.direct_light import mis_weight
+from ...transport.path import follow
+from ...transport.rules import PathRules
+from ...transport.state import PathStart
 from ..coarse_mesh.patch_points import PatchPoints
 from .direct_light import finite, sample_irradiance
 
@@ -34,7 +38,7 @@ class GatherRays:
     rank             [B]      place in ``PatchPoints.patches`` of the patch a block belongs to
     direct, escaped  [B]      W/m²: irradiance from sources, and π b, the indirect light that comes
                               from no patch; means over the rays
-    of_sources, of_others [N * B]  W/m²: the same of each ray, mean of the colour channels
+    of_emitters, of_others [N * B]  W/m²: the same of each ray, mean of the colour channels
     weight           [N * B]  throughput with which a ray ends in a patch,
     row              [N * B]  ... and the row of the irradiance table that it ends in
     start, place     [N * B]  places where it starts and where it ends (``PathEnd.place``)
@@ -43,7 +47,7 @@ class GatherRays:
     rank: np.ndarray
     direct: mi.Spectrum
     escaped: mi.Spectrum
-    of_sources: mi.Float
+    of_emitters: mi.Float
     of_others: mi.Float
     weight: mi.Spectrum
     row: mi.UInt32
@@ -97,7 +101,7 @@ class Blocks:
 
 def gather(
     scene: mi.Scene,
-    transport: Transport,
+    lookup: Lookup,
     members: PatchPoints,
     rank: np.ndarray,
     samples: int,
@@ -110,8 +114,8 @@ def gather(
     """
     cells = upload(mi.UInt32, members.cells)
     position, normal, object_id = members.points.places()
-    _, size, _ = transport.patches.find_cell(position, normal, object_id)
-    parts = transport.patches.part(position, size)
+    _, size, _ = lookup.patches.find_cell(position, normal, object_id)
+    parts = lookup.patches.part(position, size)
     dr.eval(parts)
     launch = max(MAX_LANES // samples, 1)
     found = []
@@ -119,7 +123,7 @@ def gather(
         for begin in range(0, len(rank), launch):
             some = rank[begin : begin + launch]
             seed_ = seed + 1 + begin
-            found.append(_gather(scene, transport, members, parts, cells, some, samples, seed_))
+            found.append(_gather(scene, lookup, members, parts, cells, some, samples, seed_))
             advance(len(some))
     return GatherRays.concatenate(found)
 
@@ -131,7 +135,7 @@ def block_mean(value: mi.Spectrum | mi.Float, samples: int):
     return type(value)(*(dr.block_sum(c, samples) / samples for c in value))
 
 
-def _gather(scene, transport, members, parts, cells, rank, samples, seed) -> GatherRays:
+def _gather(scene, lookup, members, parts, cells, rank, samples, seed) -> GatherRays:
 
     n_lanes = len(rank) * samples
     sampler = mi.load_dict({"type": "independent"})
@@ -157,25 +161,21 @@ def _gather(scene, transport, members, parts, cells, rank, samples, seed) -> Gat
     direction = si.to_world(wo)
 
     # ---- Direct light, by shadow rays and by the gather rays that hit a source ----
-    sources = transport.sources
-    source_row = sources.row(dr.gather(mi.UInt32, cells, member), True)
-    ds, light = sample_irradiance(scene, sources, si, source_row, v)
+    emitter_row = lookup.emitters.row(dr.gather(mi.UInt32, cells, member), True)
+    ds, light = sample_irradiance(scene, lookup.emitters, si, emitter_row, v)
     cosine = dr.maximum(dr.dot(si.sh_frame.n, ds.d), 0)
     direct = light * dr.select(ds.delta, 1, mis_weight(ds.pdf, cosine * dr.inv_pi))
 
-    start = PathState(
+    start = PathStart(
         ray=si.spawn_ray(direction),
         depth=mi.UInt32(1),
         origin=mi.Interaction3f(si),
-        source_row=source_row,
+        emitter_row=emitter_row,
         pdf=pdf,
         specular=mi.Bool(False),
-        bounded=mi.Bool(False),
-        cluster=mi.UInt32(0),
-        reach=mi.Float(dr.inf),
     )
     above = (dr.dot(si.n, direction) > 0) & (wo.z > 0)
-    end_ = follow(scene, transport, sampler, start, above)
+    end_ = follow(scene, lookup, PathRules(), sampler, start, above)
     direct += dr.pi * end_.direct
     escaped = dr.pi * (end_.radiance - end_.direct)
 
@@ -188,14 +188,14 @@ def _gather(scene, transport, members, parts, cells, rank, samples, seed) -> Gat
     kept = 1 - block_mean(dropped, samples)
     scale = dr.repeat(dr.select(kept > 0, dr.rcp(kept), 0), samples)
     direct, escaped, weight = (each(finite, scale * x) for x in (direct, escaped, end_.weight))
-    of_sources, of_others = mean_channel(direct), mean_channel(escaped)
+    of_emitters, of_others = mean_channel(direct), mean_channel(escaped)
     # Block sums evaluate what they sum up: without this, each of them would trace all rays anew.
-    dr.eval(direct, escaped, of_sources, of_others, weight, end_.row, end_.place, start_place)
+    dr.eval(direct, escaped, of_emitters, of_others, weight, end_.row, end_.place, start_place)
     weight *= dr.repeat(_excess(weight, samples), samples)
     direct, escaped = block_mean(direct, samples), block_mean(escaped, samples)
     dr.eval(direct, escaped, weight)
     return GatherRays(
-        rank, direct, escaped, of_sources, of_others, weight, end_.row, start_place, end_.place
+        rank, direct, escaped, of_emitters, of_others, weight, end_.row, start_place, end_.place
     )
 
 

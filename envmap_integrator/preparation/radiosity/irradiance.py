@@ -14,9 +14,9 @@ import numpy as np
 from scipy.sparse.linalg import LinearOperator, gmres
 
 from ...lookup.irradiance_cache import IrradianceCache
+from ...lookup.lookup import Lookup
 from ...system.jit import give_back, upload
 from ...system.progress import stage
-from ...transport.path import Transport
 from ..coarse_mesh.mesh import CoarseMesh
 from ..coarse_mesh.patch_points import PatchPoints
 from .gather import FLOATS_PER_RAY, Blocks, GatherRays, block_mean, gather
@@ -56,7 +56,7 @@ class Solution:
 
 def solve_irradiance(
     scene: mi.Scene,
-    transport: Transport,
+    lookup: Lookup,
     mesh: CoarseMesh,
     samples: int,
     more_rays: int = 0,
@@ -76,18 +76,18 @@ def solve_irradiance(
     n_channels, n_used = len(mi.Spectrum()), len(members.patches)
     if n_used == 0:  # Nothing but mirrors and glass.
         table = dr.zeros(mi.Float, 2 * n_patches * n_channels)
-        no_cell = np.zeros(dr.width(transport.patches.levels), dtype=bool)
-        cache = IrradianceCache(transport.patches, table)
+        no_cell = np.zeros(dr.width(lookup.patches.levels), dtype=bool)
+        cache = IrradianceCache(lookup.patches, table)
         return Solution(cache, None, np.zeros(n_patches), no_cell)
 
     def send(rank, seed):
-        return gather(scene, transport, members, rank, samples, seed)
+        return gather(scene, lookup, members, rank, samples, seed)
 
     rank = np.arange(n_used)
     for further in range(len(MORE) + 1):
         rays = send(rank, seed + further * SEED_STEP)
         blocks = Blocks(rank, n_used)
-        cache = IrradianceCache(transport.patches, _solve(n_patches, members.patches, rays, blocks))
+        cache = IrradianceCache(lookup.patches, _solve(n_patches, members.patches, rays, blocks))
         noise = cache_noise(rays, blocks, cache, members)
         steep = noise.steep & (may_divide and further < len(MORE))
         if further == len(MORE) or steep.any():

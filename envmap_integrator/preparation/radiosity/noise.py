@@ -90,17 +90,15 @@ def cache_noise(
     irradiance = table[2 * members.patches]
     views = _views(members, irradiance)
     total, indirect = _importance(rays, blocks, cache, members, views)
-    n_cells = dr.width(cache.patches.levels)
     of_patches = mean_channel(rays.weight * cache.irradiance(rays.row))
     dr.eval(of_patches)
     # What is seen first gathers by rays of its own, as if it were patches.
     importance = (indirect + views).sum(axis=1)
-    arriving = of_patches.numpy()
-    coarse = coarseness(rays, blocks, table, arriving, importance, members, n_cells)
+    coarse = coarseness(rays, blocks, cache, of_patches, importance, members)
 
     # ---- Scatter within each block: rays k and k ^ step start in neighbouring directions ----
     step = 1 << (samples.bit_length() - 1) // 2
-    sources, others = rays.of_sources, rays.of_others + of_patches
+    sources, others = rays.of_emitters, rays.of_others + of_patches
     t, i = total[rank], indirect[rank]
     block = sum(
         importance * _block_sum(x, samples)[:, None] / samples

@@ -1,0 +1,110 @@
+"""Lobes of materials: which of them cached irradiance may stand for, and the choice among them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+#: Directions sampled more densely than this [1/sr] belong to a lobe for which a Lambertian
+#: stand-in would misplace the light: they are traced on instead of read from the cache.
+#: (A cosine lobe has 0.32 at most.)
+NARROW_PDF = 1.0
+#: Choices among the lobes of a surface that the cache serves: those that it can't stand for, such
+#: as the gloss of a varnish, are found as many times more often as if one choice were made.
+LOBE_CHOICES = 4
+
+
+def is_diffuse(bsdf: mi.BSDFPtr) -> mi.Bool:
+    """May the cache serve a material?
+
+    Metals and glass, however rough, reflect by where the light comes from, which the cache doesn't
+    know. In glass, a lobe chosen seldom has a low density besides, and looks wider than it is.
+    """
+    flags = bsdf.flags()
+    transmits = mi.has_flag(flags, mi.BSDFFlags.GlossyTransmission)
+    return mi.has_flag(flags, mi.BSDFFlags.DiffuseReflection) & ~transmits
+
+
+def is_delta(bsdf: mi.BSDFPtr) -> mi.Bool:
+    """Does a material do nothing but reflect and refract as perfect mirrors and glass?"""
+    flags = bsdf.flags()
+    return mi.has_flag(flags, mi.BSDFFlags.Delta) & ~mi.has_flag(flags, mi.BSDFFlags.Smooth)
+
+
+def single_lobe(bsdf: mi.BSDFPtr) -> mi.Bool:
+    """Does a material scatter by diffuse reflection alone?"""
+    others = mi.BSDFFlags.Glossy | mi.BSDFFlags.Delta | mi.BSDFFlags.DiffuseTransmission
+    return (bsdf.flags() & int(others)) == 0
+
+
+def only_wide(bsdf: mi.BSDFPtr) -> mi.Bool:
+    """Are all smooth lobes of a material diffuse reflection, wide by nature?"""
+    flags = bsdf.flags()
+    narrow = mi.BSDFFlags.Glossy | mi.BSDFFlags.DiffuseTransmission
+    return (flags & int(narrow)) == 0
+
+
+def is_wide(si: mi.SurfaceInteraction3f, wo: mi.Vector3f, pdf: mi.Float) -> mi.Bool:
+    """Is light from ``wo`` reflected by a lobe so wide that cached irradiance may stand for it?
+
+    ``wo`` is in the local frame, ``pdf`` [1/sr] the density with which the material samples it. The
+    cache holds the side that the path arrived on: transmission never qualifies.
+    """
+    return (pdf <= NARROW_PDF) & (mi.Frame3f.cos_theta(si.wi) * mi.Frame3f.cos_theta(wo) > 0)
+
+
+@dataclass
+class Scattered:
+    """Where a path goes on from a surface.
+
+    bs         the direction,
+    weight     [1]  ... what the path is multiplied by, zero if it goes nowhere,
+    specular   ... whether it is that of a mirror or of glass,
+    wide       ... and whether it belongs to the lobes that the cache may stand for
+    """
+
+    bs: mi.BSDFSample3f
+    weight: mi.Spectrum
+    specular: mi.Bool
+    wide: mi.Bool
+
+    @staticmethod
+    def of(si: mi.SurfaceInteraction3f, bs: mi.BSDFSample3f, weight: mi.Spectrum) -> Scattered:
+        """A direction that a material has sampled."""
+        specular = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        return Scattered(bs, weight, specular, is_wide(si, bs.wo, bs.pdf) & ~specular)
+
+
+@dr.syntax
+def choose_lobes(bsdf, si, sampler, active, residual) -> tuple[mi.Spectrum, Scattered]:
+    """Sample a material ``LOBE_CHOICES`` times, stratified over its lobes.
+
+    Returns the weight [1] of the wide lobes, for which the cache stands, and one direction for all
+    that it can't stand for. Where a ``residual`` is to be estimated, that may be one of a wide
+    lobe, though less often.
+    """
+    count = LOBE_CHOICES
+    cached, weight = mi.Spectrum(0), mi.Spectrum(0)
+    bs = dr.zeros(mi.BSDFSample3f)
+    wide, i, chances = mi.Bool(False), mi.UInt32(0), mi.Float(0)
+    active = mi.Bool(active)
+    u = sampler.next_1d()
+    while dr.hint(active, exclude=[bsdf, si, residual], label="Choose lobes"):
+        lobe = (mi.Float(i) + u) / count
+        one, one_weight = bsdf.sample(mi.BSDFContext(), si, lobe, sampler.next_2d(), active)
+        delta = mi.has_flag(one.sampled_type, mi.BSDFFlags.Delta)
+        one_wide = is_wide(si, one.wo, one.pdf) & ~delta
+        cached += dr.select(one_wide, one_weight, 0)
+        chance = dr.select(one_wide, dr.select(residual, mi.Float(1), 0), count - 1)
+        chance = dr.select(dr.max(one_weight) > 0, chance, 0)
+        chances += chance
+        taken = sampler.next_1d() * chances < chance
+        bs = dr.select(taken, one, bs)
+        wide = dr.select(taken, one_wide, wide)
+        weight = dr.select(taken, one_weight / chance, weight)
+        i += 1
+        active &= i < count
+    specular = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+    return cached / count, Scattered(bs, weight * chances / count, specular, wide)
