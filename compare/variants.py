@@ -51,8 +51,8 @@ def patches_unblended() -> AbstractContextManager:
     """The cache is read at the place itself, not at random up to half a patch beside it."""
     find = Patches.find
 
-    def find_own(self, p, normal, object_id, size, active=True, u=None):
-        return find(self, p, normal, object_id, size, active)
+    def find_own(self, p, normal, object_id, cell, active=True, u=None):
+        return find(self, p, normal, object_id, cell, active)
 
     return patch.object(Patches, "find", find_own)
 

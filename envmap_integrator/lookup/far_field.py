@@ -31,7 +31,7 @@ class Cube:
     half_width: mi.Float
     valid: mi.Bool
 
-    def exit(self, o, d):
+    def exit(self, o: mi.Point3f, d: mi.Vector3f) -> mi.Float:
         """Distance along a ray from inside to the cube's surface, infinite if there is no cube."""
         return dr.select(self.valid, exit_distance(self.centre, self.half_width, o, d), dr.inf)
 
@@ -66,7 +66,7 @@ class FarField:
     emitter_scene: mi.Scene | None
     has_environment: bool
 
-    def cube(self, cell, p, active):
+    def cube(self, cell: mi.UInt32, p: mi.Point3f, active: mi.Bool) -> Cube:
         """The cube whose map serves rays from a point in a cell of the coarse mesh.
 
         None where the cell belongs to no cluster or the point isn't in the cluster's cube.
@@ -78,7 +78,9 @@ class FarField:
         active &= dr.all(dr.abs(p - centre) < half_width)
         return Cube(cluster, centre, half_width, active)
 
-    def bound(self, cube, ray, wide, u, active):
+    def bound(
+        self, cube: Cube, ray: mi.Ray3f, wide: mi.Bool, u: mi.Float, active: mi.Bool | bool
+    ) -> tuple[mi.Bool, mi.Float, mi.Float]:
         """Bound secondary rays by their cube: ``(bounded, maxt, reach)``.
 
         Only wide lobes are bounded, unless mirrors are to read the map too: tracing the few narrow
@@ -91,7 +93,16 @@ class FarField:
         maxt = dr.select(bounded, t * (1 + HAND_OFF * u), dr.largest(mi.Float))
         return bounded, maxt, dr.select(bounded & wide, t, dr.inf)
 
-    def eval(self, cluster, o, d, pdf, specular, u_level, u_texel, active):
+    def eval(
+        self,
+        cluster: mi.UInt32,
+        ray: mi.Ray3f,
+        pdf: mi.Float,
+        specular: mi.Bool,
+        u_level: mi.Float,
+        u_texel: mi.Point2f,
+        active: mi.Bool,
+    ) -> tuple[mi.Spectrum, mi.Bool]:
         """Far radiance along rays that have left their cube, from the prefiltered map.
 
         Returns the radiance [W/m²/sr] and whether it can be trusted. The level is chosen so that
@@ -100,11 +111,11 @@ class FarField:
         """
         cube = dr.gather(mi.Vector4f, self.cubes, cluster, active)
         centre = mi.Point3f(cube.x, cube.y, cube.z)
-        offset = o - centre
+        offset, d = ray.o - centre, ray.d
         trusted = mi.Bool(True)
         footprint = mi.Float(1)
         if not self.corrected:
-            far = offset + exit_distance(centre, cube.w, o, d) * d
+            far = offset + exit_distance(centre, cube.w, ray.o, d) * d
         else:
             far = mi.Vector3f(d)
             b = dr.dot(offset, d)
@@ -140,7 +151,9 @@ class FarField:
         n_channels = len(mi.Spectrum())
         return mi.Spectrum(*(value[i] for i in range(n_channels))), trusted
 
-    def intersect_emitters(self, scene, ray, active):
+    def intersect_emitters(
+        self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool
+    ) -> tuple[mi.SurfaceInteraction3f, mi.Bool]:
         """Find the emitter that a ray beyond its cube reaches, if any.
 
         Cheap and exact: the ray meets a scene of emitters only, and visibility is tested where it
@@ -206,6 +219,6 @@ def _emitter_scene(scene: mi.Scene) -> mi.Scene:
     return emitters
 
 
-def texel_type():
+def texel_type() -> type:
     """Type of a packed texel: radiance and inverse distance."""
     return {1: mi.Vector2f, 3: mi.Vector4f}[len(mi.Spectrum())]

@@ -27,6 +27,36 @@ LEVEL_BITS, MARK_BITS = 4, 2
 UNEVEN, DROPPED = 1, 2
 
 
+@dataclass
+class Cell:
+    """The large cell that a place lies in.
+
+    index        of the cell,
+    patch_size   ... edge of the patches in it [world units],
+    found        ... and whether there is one
+    """
+
+    index: mi.UInt32
+    patch_size: mi.Float
+    found: mi.Bool
+
+
+@dataclass
+class FoundPatch:
+    """The patch that stands for a place.
+
+    index   of the patch,
+    found   ... and whether there is one: surfaces too small to have been hit have none
+    even    whether direct light is even there: else the patch stands for indirect light alone
+    own     index of the patch that the place itself lies in, P if there is none
+    """
+
+    index: mi.UInt32
+    found: mi.Bool
+    even: mi.Bool
+    own: mi.UInt32
+
+
 @dataclass(frozen=True)
 class Patches:
     """Two hash tables: large cell → level of division, cell of that level → patch.
@@ -52,29 +82,36 @@ class Patches:
         """Number of patch indices P, used or not."""
         return dr.width(self.cells)
 
-    def find_cell(self, p, normal, object_id, active=True):
-        """Look up the large cell of an oriented surface point.
-
-        Returns ``(cell, size, found)``: the index of the cell, the edge of the patches in it in
-        world units, and whether there is such a cell.
-        """
+    def locate(
+        self,
+        p: mi.Point3f,
+        normal: mi.Normal3f,
+        object_id: mi.UInt32,
+        active: mi.Bool | bool = True,
+    ) -> Cell:
+        """Look up the large cell of a surface point, on the side of its geometric normal."""
         identity = self.identity_of(normal, object_id)
         entry, found, cell = self._probe(self.levels, p, identity, mi.UInt32(0), LEVEL_BITS, active)
         level = entry & ((1 << LEVEL_BITS) - 1)
-        return cell, self.size / mi.Float(mi.UInt32(1) << level), found
+        return Cell(cell, self.size / mi.Float(mi.UInt32(1) << level), found)
 
-    def find(self, p, normal, object_id, size, active=True, u=None):
-        """Look up the patch of an oriented surface point in a cell with patches of edge ``size``.
-
-        Returns ``(patch, found, even, own)``. Surfaces too small to have been hit have no patch;
-        where direct light isn't ``even``, the patch's irradiance stands for indirect light alone.
-        ``own`` is the patch that the point itself lies in, P if there is none.
+    def find(
+        self,
+        p: mi.Point3f,
+        normal: mi.Normal3f,
+        object_id: mi.UInt32,
+        cell: Cell,
+        active: mi.Bool | bool = True,
+        u: mi.Point2f | None = None,
+    ) -> FoundPatch:
+        """Look up the patch of a surface point in its cell.
 
         With ``u``, uniform in the unit square, the point is moved at random by up to half a patch
         along the surface: the expectation interpolates between patches, so their borders don't
         show. Where the moved point belongs to no patch (beyond an edge of the surface), the patch
         of the point itself is taken; where that one has been left out, there is none.
         """
+        active, size = active & cell.found, cell.patch_size
         level = mi.UInt32(dr.log2(self.size / size) + 0.5)
         identity = self.identity_of(normal, object_id)
         marks, exists, own = self._probe(self.cells, p, identity, level, MARK_BITS, active)
@@ -82,7 +119,7 @@ class Patches:
         found = exists & ~dropped
         own_or_none = dr.select(exists, own, dr.opaque(mi.UInt32, self.count))
         if u is None:
-            return own, found, (marks & UNEVEN) == 0, own_or_none
+            return FoundPatch(own, found, (marks & UNEVEN) == 0, own_or_none)
 
         frame = mi.Frame3f(normal)
         moved = p + size * (frame.s * (u.x - 0.5) + frame.t * (u.y - 0.5))
@@ -96,15 +133,15 @@ class Patches:
         )
         hit &= (entry & DROPPED) == 0
         even = ((marks | dr.select(hit, entry, 0)) & UNEVEN) == 0
-        return dr.select(hit, patch, own), found | hit, even, own_or_none
+        return FoundPatch(dr.select(hit, patch, own), found | hit, even, own_or_none)
 
-    def part(self, p, size) -> mi.UInt32:
-        """Which of its parts a point lies in, in a patch of edge ``size``."""
+    def part(self, p: mi.Point3f, size: mi.Float) -> mi.UInt32:
+        """Which of its ``PARTS`` a point lies in, in a patch of edge ``size`` [world units]."""
         half = dr.floor((p - self.origin) * (2 / size))
         half = mi.Vector3u(mi.Vector3i(half) & 1)
         return half.x + 2 * half.y + 4 * half.z
 
-    def identity_of(self, normal, object_id):
+    def identity_of(self, normal: mi.Normal3f, object_id: mi.UInt32) -> mi.UInt32:
         """What tells patches in the same cell apart."""
         direction = normal_direction(normal)
         return direction + object_id * 8 if self.use_objects else direction
@@ -126,7 +163,7 @@ class Patches:
         return entry, found, index
 
 
-def normal_direction(normal):
+def normal_direction(normal: mi.Normal3f) -> mi.UInt32:
     """Dominant signed axis of a direction, 0 … 5.
 
     The frame is turned a little, so that 45 degree faces, common in buildings, don't fall on a tie.
@@ -142,7 +179,9 @@ def normal_direction(normal):
     return 2 * axis + dr.select(component < 0, mi.UInt32(1), mi.UInt32(0))
 
 
-def cell_hash(cell, identity, level):
+def cell_hash(
+    cell: mi.Vector3i, identity: mi.UInt32, level: mi.UInt32
+) -> tuple[mi.UInt32, mi.UInt32]:
     """Two independent hashes of a cell: its slot and its fingerprint.
 
     Fingerprints aren't zero, also without the bits that a level takes in their place.

@@ -50,29 +50,29 @@ def serve(
 
     (So many parameters, as each stage takes what it reads and no more.)
     """
-    si, size = vertex.si, vertex.patch_size
-    deep = vertex.has_cell & is_diffuse(vertex.bsdf) & (path.depth >= rules.gather_depth)
-    patch, has_patch, even, own = lookup.patches.find(
-        si.p, vertex.normal, vertex.object_id, size, deep, spare.next_2d()
+    si = vertex.si
+    deep = is_diffuse(vertex.bsdf) & (path.depth >= rules.gather_depth)
+    patch = lookup.patches.find(
+        si.p, vertex.normal, vertex.object_id, vertex.cell, deep, spare.next_2d()
     )
     # A coarse mesh can't serve hits about as near as its patches are large (corners, contacts). The
     # threshold is random, so that no border shows.
-    near = dr.norm(si.p - path.origin.p) < size * (0.5 + spare.next_1d())
+    near = dr.norm(si.p - path.origin.p) < vertex.cell.patch_size * (0.5 + spare.next_1d())
     # A sensor is no surface. And gather rays start all over their own patch: what they read near it
     # is an average anyway.
     if start.primary or lookup.cache is None:
         near &= path.bounces > 0
-    could = has_patch & ~near
+    could = patch.found & ~near
     # Total irradiance stands for direct light too: single shadow rays beside a lamp are noisy. But
     # where it changes within patches, a ray knows better.
-    lit = mi.Bool(False) if rules.shadow_rays else could & even & (path.depth > 0)
+    lit = mi.Bool(False) if rules.shadow_rays else could & patch.even & (path.depth > 0)
     residual, served = could & goes_on, could & ~goes_on
     boost = dr.select(residual, dr.rcp(path.going_on), 1)
     share = WideShare(
         lit=lit & served, alone=could & ~(residual & lit), boost=dr.select(lit, boost, 1)
     )
-    row = 2 * patch + dr.select(lit, mi.UInt32(0), mi.UInt32(1))
-    return Service(served, residual, boost, own, row, share)
+    row = 2 * patch.index + dr.select(lit, mi.UInt32(0), mi.UInt32(1))
+    return Service(served, residual, boost, patch.own, row, share)
 
 
 def record_end(
@@ -87,7 +87,7 @@ def record_end(
     ends = service.served & scattered.wide
     found.weight[ends] = path.throughput * scattered.weight
     found.row[ends] = service.row
-    part = lookup.patches.part(vertex.si.p, vertex.patch_size)
+    part = lookup.patches.part(vertex.si.p, vertex.cell.patch_size)
     found.place[ends] = PARTS * service.own + part
     return ends
 

@@ -53,8 +53,7 @@ def look_up_far(
     left = path.active & path.bounded & ~si.is_valid()
     radiance, trusted = far_field.eval(
         path.cluster,
-        ray.o,
-        ray.d,
+        ray,
         path.pdf,
         path.specular,
         spare.next_1d(),

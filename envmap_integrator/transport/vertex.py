@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from ..lookup.far_field import Cube
 from ..lookup.lookup import Lookup
+from ..lookup.patches import Cell
 from ..system.ray_counts import Ray, count
 
 
@@ -20,8 +21,7 @@ class Vertex:
     hit                whether there is one,
     smooth             ... and whether it reflects light from emitters
     normal, object_id  geometric normal on the side that was hit, and dense id of the shape
-    cell, has_cell     large cell of the coarse mesh, and whether there is one
-    patch_size         edge of the patches in it [world units]
+    cell               large cell of the coarse mesh
     emitter_row        of the choice among emitters there
     cube               bounds secondary rays from it; None without maps
     """
@@ -32,9 +32,7 @@ class Vertex:
     smooth: mi.Bool
     normal: mi.Normal3f
     object_id: mi.UInt32
-    cell: mi.UInt32
-    has_cell: mi.Bool
-    patch_size: mi.Float
+    cell: Cell
     emitter_row: mi.UInt32
     cube: Cube | None
 
@@ -47,10 +45,10 @@ class Vertex:
         mapped = hit if far_field is not None and far_field.map_mirrors else smooth
         normal = dr.mulsign(si.n, -dr.dot(si.n, ray.d))
         object_id = lookup.object_ids(si)
-        cell, size, found = lookup.patches.find_cell(si.p, normal, object_id, mapped)
-        row = lookup.emitters.row(cell, found)
-        cube = None if far_field is None else far_field.cube(cell, si.p, found)
-        return Vertex(si, bsdf, hit, smooth, normal, object_id, cell, found, size, row, cube)
+        cell = lookup.patches.locate(si.p, normal, object_id, mapped)
+        row = lookup.emitters.row(cell.index, cell.found)
+        cube = None if far_field is None else far_field.cube(cell.index, si.p, cell.found)
+        return Vertex(si, bsdf, hit, smooth, normal, object_id, cell, row, cube)
 
 
 @dr.syntax

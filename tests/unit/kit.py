@@ -59,9 +59,9 @@ class CoarseMesh(build.CoarseMesh):
             mi.UInt32(points.object_id),
         )
         u = u if u is None else mi.Point2f(u.astype(np.float32))
-        _, size, known = self.patches.find_cell(p, normal, object_id)
-        patch, found, *_ = self.patches.find(p, normal, object_id, size, known, u)
-        return patch.numpy(), size.numpy(), found.numpy()
+        cell = self.patches.locate(p, normal, object_id)
+        patch = self.patches.find(p, normal, object_id, cell, u=u)
+        return patch.index.numpy(), cell.patch_size.numpy(), patch.found.numpy()
 
     def solve(self, samples: int = 64) -> IrradianceCache:
         return self.solution(samples).cache

@@ -88,8 +88,10 @@ def look_up(
     count = len(d)
     radiance, trusted = field.eval(
         mi.UInt32(0),
-        mi.Point3f(np.broadcast_to(o, (count, 3)).T.astype(np.float32)),
-        mi.Vector3f(d.T.astype(np.float32)),
+        mi.Ray3f(
+            mi.Point3f(np.broadcast_to(o, (count, 3)).T.astype(np.float32)),
+            mi.Vector3f(d.T.astype(np.float32)),
+        ),
         mi.Float(pdf),
         mi.Bool(specular),
         mi.Float(u_level),

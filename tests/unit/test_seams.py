@@ -77,8 +77,7 @@ def look_up(levels: list[np.ndarray], level: int, d: np.ndarray, u: np.ndarray) 
     pdf = 0.25 * (RESOLUTION >> level) ** 2 * (uv**2).sum(axis=1) ** 1.5
     radiance, trusted = field.eval(
         mi.UInt32(0),
-        mi.Point3f(0),
-        mi.Vector3f(d.T.astype(np.float32)),
+        mi.Ray3f(mi.Point3f(0), mi.Vector3f(d.T.astype(np.float32))),
         mi.Float(pdf.astype(np.float32)),
         mi.Bool(False),
         mi.Float(0.5),

@@ -72,8 +72,8 @@ def on_the_floor(hall, x: float | mi.Float, n: int = 1):
     si = dr.zeros(mi.SurfaceInteraction3f, n)
     si.p, si.n = mi.Point3f(x, 0.1, 0), mi.Normal3f(0, 0, 1)
     si.sh_frame = mi.Frame3f(si.n)
-    cell, _, found = hall.patches.find_cell(si.p, si.n, _floor_id(hall))
-    return si, cell, found
+    cell = hall.patches.locate(si.p, si.n, _floor_id(hall))
+    return si, cell.index, cell.found
 
 
 def _floor_id(hall):

@@ -90,7 +90,7 @@ def only_standing(mesh: CoarseMesh) -> CoarseMesh:
     if len(points) == 0:  # Nothing but mirrors and glass.
         return mesh
     place = points.places()
-    _, size, _ = patches.find_cell(*place)
+    size = patches.locate(*place).patch_size
     part = PARTS * patch_of_point + patches.part(place[0], size).numpy()
     has_patch, seen = patch_of_point >= 0, points.seen > 0
     visited = np.zeros(PARTS * patches.count, dtype=bool)

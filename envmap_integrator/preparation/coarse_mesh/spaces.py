@@ -139,9 +139,10 @@ def _looked_at(scene, object_ids, patches, si, space_of_patch, sampler, active) 
     count(Ray.SURVEY, ray, active)
     hit = scene.ray_intersect(ray, active)
     normal, objects = dr.mulsign(hit.n, -dr.dot(hit.n, ray.d)), object_ids(hit)
-    _, size, found = patches.find_cell(hit.p, normal, objects, active & hit.is_valid())
-    patch, found, *_ = patches.find(hit.p, normal, objects, size, found)
-    return dr.select(found, dr.gather(mi.UInt32, space_of_patch, patch, found), UNKNOWN)
+    cell = patches.locate(hit.p, normal, objects, active & hit.is_valid())
+    patch = patches.find(hit.p, normal, objects, cell)
+    space = dr.gather(mi.UInt32, space_of_patch, patch.index, patch.found)
+    return dr.select(patch.found, space, UNKNOWN)
 
 
 def _look_around(scene, object_ids, mesh, space_of_patch, seed):
@@ -165,20 +166,20 @@ def _look_around(scene, object_ids, mesh, space_of_patch, seed):
     known = own != UNKNOWN
 
     # ---- Twice as far as the renderer jitters its look-ups, to be on the safe side ----
-    _, size, found = patches.find_cell(si.p, si.n, object_id, known)
+    near = patches.locate(si.p, si.n, object_id, known)
     u = sampler.next_2d()
     frame = mi.Frame3f(si.n)
-    p = si.p + size * (frame.s * (u.x - 0.5) + frame.t * (u.y - 0.5))
-    cell, size, found = patches.find_cell(p, si.n, object_id, found)
-    patch, has_patch, *_ = patches.find(p, si.n, object_id, size, found, sampler.next_2d())
+    p = si.p + near.patch_size * (frame.s * (u.x - 0.5) + frame.t * (u.y - 0.5))
+    cell = patches.locate(p, si.n, object_id, near.found)
+    patch = patches.find(p, si.n, object_id, cell, u=sampler.next_2d())
 
-    other = dr.gather(mi.UInt32, space_of_patch, patch, has_patch) != own
+    other = dr.gather(mi.UInt32, space_of_patch, patch.index, patch.found) != own
     foreign = dr.zeros(mi.Bool, patches.count)
-    dr.scatter(foreign, mi.Bool(True), patch, has_patch & other)
+    dr.scatter(foreign, mi.Bool(True), patch.index, patch.found & other)
     n_cells = dr.width(patches.levels)
     first = dr.full(mi.UInt32, int(space.max()) + 1, n_cells)
     last = dr.zeros(mi.UInt32, n_cells)
-    dr.scatter_reduce(dr.ReduceOp.Min, first, own, cell, found)
-    dr.scatter_reduce(dr.ReduceOp.Max, last, own, cell, found)
+    dr.scatter_reduce(dr.ReduceOp.Min, first, own, cell.index, cell.found)
+    dr.scatter_reduce(dr.ReduceOp.Max, last, own, cell.index, cell.found)
     dr.eval(foreign, first, last)
     return foreign.numpy(), first.numpy() < last.numpy()

@@ -180,7 +180,7 @@ def scatter_points(
     def lines(n_rays, batch):
         sampler.seed(1009 * (MAX_BATCHES * seed + batch), n_rays)
         ray, within = _global_lines(spheres, sampler, n_rays)
-        return [_hits_along(scene, object_ids, sampler, ray, LINE_HITS, wanted, within=within)]
+        return [_hits_along(scene, object_ids, sampler, ray, wanted, within=within)]
 
     return SurfacePoints.concatenate(points + _enough(lines, count, LINE_HITS))
 
@@ -196,7 +196,7 @@ def walk_from(
 
 def _walk(scene, object_ids, sampler, sensor, n_rays, wanted, number) -> SurfacePoints:
     ray = _sensor_rays(sensor, sampler)
-    return _hits_along(scene, object_ids, sampler, ray, WALK_HITS, wanted, walk=number)
+    return _hits_along(scene, object_ids, sampler, ray, wanted, walk=number)
 
 
 def _spheres(scene: mi.Scene, walks: list[SurfacePoints]) -> np.ndarray:
@@ -270,16 +270,15 @@ def _hits_along(
     object_ids: ObjectIds,
     sampler: mi.Sampler,
     ray: mi.Ray3f,
-    n_hits: int,
     wanted: mi.BSDFFlags,
     walk: int = 0,
     within: mi.Vector4f | None = None,
 ) -> SurfacePoints:
-    """Follow rays over ``n_hits`` hits, on a walk of a sensor or straight through surfaces.
+    """Follow rays over several hits, on a walk of a sensor or straight through surfaces.
 
     Points are kept where the BSDF has any of the ``wanted`` flags, and ``within`` a sphere.
     """
-    n_rays = dr.width(ray)
+    n_rays, n_hits = dr.width(ray), WALK_HITS if walk else LINE_HITS
     size = n_hits * n_rays
     positions, normals, shading_normals = (dr.zeros(mi.Float, 3 * size) for _ in range(3))
     object_of_point, reflects = dr.zeros(mi.UInt32, size), dr.zeros(mi.Float, size)

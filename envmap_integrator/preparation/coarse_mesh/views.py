@@ -66,13 +66,12 @@ def service(scene: mi.Scene, object_ids: ObjectIds, patches: Patches, sensor: mi
     if len(points) == 0:
         return Service(1.0, np.inf)  # Nothing is asked for.
     place = points.places()
-    _, size, found = patches.find_cell(*place)
-    patch, found, *_ = patches.find(*place, size, found)
-    return _service(np.where(found.numpy(), patch.numpy().astype(np.int64), -1))
+    patch = patches.find(*place, patches.locate(*place))
+    return _service(np.where(patch.found.numpy(), patch.index.numpy().astype(np.int64), -1))
 
 
 def _service(patch: np.ndarray) -> Service:
-    """Of the patches [N] of what rays meet, -1 where there is none."""
+    """How well a mesh serves rays, by the patches [N] of what they meet, -1 where there is none."""
     if len(patch) == 0:
         return Service(1.0, np.inf)
     found = patch[patch >= 0]

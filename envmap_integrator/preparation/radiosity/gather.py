@@ -112,10 +112,9 @@ def gather(
     Rays start from random ones of the points, with as many shadow rays. ``samples`` must be a power
     of two.
     """
-    cells = upload(mi.UInt32, members.cells)
     position, normal, object_id = members.points.places()
-    _, size, _ = lookup.patches.find_cell(position, normal, object_id)
-    parts = lookup.patches.part(position, size)
+    cell = lookup.patches.locate(position, normal, object_id)
+    parts = lookup.patches.part(position, cell.patch_size)
     dr.eval(parts)
     launch = max(MAX_LANES // samples, 1)
     found = []
@@ -123,7 +122,7 @@ def gather(
         for begin in range(0, len(rank), launch):
             some = rank[begin : begin + launch]
             seed_ = seed + 1 + begin
-            found.append(_gather(scene, lookup, members, parts, cells, some, samples, seed_))
+            found.append(_gather(scene, lookup, members, parts, some, samples, seed_))
             advance(len(some))
     return GatherRays.concatenate(found)
 
@@ -135,8 +134,7 @@ def block_mean(value: mi.Spectrum | mi.Float, samples: int):
     return type(value)(*(dr.block_sum(c, samples) / samples for c in value))
 
 
-def _gather(scene, lookup, members, parts, cells, rank, samples, seed) -> GatherRays:
-
+def _gather(scene, lookup, members, parts, rank, samples, seed) -> GatherRays:
     n_lanes = len(rank) * samples
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, n_lanes)
@@ -161,7 +159,9 @@ def _gather(scene, lookup, members, parts, cells, rank, samples, seed) -> Gather
     direction = si.to_world(wo)
 
     # ---- Direct light, by shadow rays and by the gather rays that hit a source ----
-    emitter_row = lookup.emitters.row(dr.gather(mi.UInt32, cells, member), True)
+    emitter_row = lookup.emitters.row(
+        dr.gather(mi.UInt32, upload(mi.UInt32, members.cells), member), True
+    )
     ds, light = sample_irradiance(scene, lookup.emitters, si, emitter_row, v)
     cosine = dr.maximum(dr.dot(si.sh_frame.n, ds.d), 0)
     direct = light * dr.select(ds.delta, 1, mis_weight(ds.pdf, cosine * dr.inv_pi))
