@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from .patches import Patches
 
@@ -25,3 +26,8 @@ class IrradianceCache:
     def irradiance(self, row: mi.UInt32, active=True) -> mi.Spectrum:
         """Irradiance [W/m²] in a row of the table."""
         return dr.gather(mi.Spectrum, self.table, row, active)
+
+    def mean_channel(self) -> np.ndarray:
+        """The table's rows [2 * P] in W/m², mean of the colour channels."""
+        n_channels = len(mi.Spectrum())
+        return self.table.numpy().reshape(-1, n_channels) @ np.full(n_channels, 1 / n_channels)

@@ -24,6 +24,7 @@ class PatchPoints:
     first     [K + 1]  where the points of each begin
     index              which points stand for patches, sorted
     cells     [K]      large cell of each patch, -1 if it has none
+    n_cells            number C of large cells in the mesh
     points             all surface points
     """
 
@@ -36,6 +37,7 @@ class PatchPoints:
         self.patches = np.flatnonzero(np.diff(by_patch.indptr))
         self.first = np.append(by_patch.indptr[self.patches], len(standing)).astype(np.uint32)
         self.points = points
+        self.n_cells = dr.width(mesh.patches.levels)
         key = self._parts(points.position[by_patch.data])
         order = np.argsort(key, kind="stable")
         self.index = by_patch.data[order]

@@ -18,7 +18,6 @@ import mitsuba as mi
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from ...lookup.irradiance_cache import IrradianceCache
 from ...lookup.patches import PARTS
 from ...system.jit import mean_channel, upload
 from ..coarse_mesh.patch_points import PatchPoints
@@ -53,20 +52,19 @@ class Coarseness:
 def coarseness(
     rays: GatherRays,
     blocks: Blocks,
-    cache: IrradianceCache,
+    table: np.ndarray,
     arriving: mi.Float,
     importance: np.ndarray,
     members: PatchPoints,
 ) -> Coarseness:
     """Compare what paths read with what is found where they read it.
 
-    ``arriving`` [N * B] is what each ray brings of the cache's irradiance, mean of the colour
-    channels, and ``importance`` [K] how much the picture changes with the indirect irradiance of a
-    patch.
+    ``table`` [2 * P] is the irradiance, ``arriving`` [N * B] what each ray brings of it from the
+    patch that it ends in, both the mean of the colour channels, and ``importance`` [K] how much the
+    picture changes with the indirect irradiance of a patch.
     """
     n_used = len(members.patches)
     to_patch = csr_matrix((np.ones(len(rays)), (blocks.rank, np.arange(len(rays)))))
-    irradiance = cache.table.numpy().reshape(-1, len(mi.Spectrum())).mean(axis=1)
 
     # ---- Irradiance of each part of a patch, by the rays that start there ----
     count, total, indirect = (to_patch @ sums for sums in _by_part(rays, arriving))
@@ -74,12 +72,12 @@ def coarseness(
     found = np.stack([per_ray * total, per_ray * indirect], axis=-1)
 
     # ---- What the picture reads there, by the rays that end there ----
-    largest = max(irradiance.max(), found.max(), 1e-30)
+    largest = max(table.max(), found.max(), 1e-30)
     share = importance / (blocks.count * rays.samples)
-    ends = _Ends(rays, members.patches, cache.patches.count, count > 0)
+    ends = _Ends(rays, members.patches, len(table) // 2, count > 0)
     weight = ends.weight(share[blocks.rank])
     excess = weight * (
-        dr.gather(mi.Float, upload(mi.Float, irradiance), rays.row)
+        dr.gather(mi.Float, upload(mi.Float, table), rays.row)
         - dr.gather(mi.Float, upload(mi.Float, found), 2 * ends.slot + (rays.row & 1), ends.known)
     )
     # Throughputs of a block come to 1 at most, see ``gather``.
@@ -92,11 +90,11 @@ def coarseness(
     ].reshape(-1, PARTS)
     of_patch = _exact_sums(weight, ends.read_rank, n_used + 1, most)[:-1]
     of_patch /= np.maximum(count.sum(axis=1), 1)
-    own = irradiance[2 * members.patches + 1]
+    own = table[2 * members.patches + 1]
     squares = _squares(rays, arriving, blocks.rank, of_part - of_patch[:, None], own)
     variance = to_patch @ squares
 
-    n_cells = dr.width(cache.patches.levels)
+    n_cells = members.n_cells
     known = members.cells >= 0
     by_cell, variance = (
         np.bincount(members.cells[known], x[known], n_cells) for x in (by_patch, variance)

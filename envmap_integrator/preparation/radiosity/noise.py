@@ -86,7 +86,7 @@ def cache_noise(
 ) -> Noise:
     """Find out how uncertain a cache is that was solved from ``blocks`` of ``rays``."""
     samples, rank = rays.samples, blocks.rank
-    table = cache.table.numpy().reshape(-1, len(mi.Spectrum())).mean(axis=1)
+    table = cache.mean_channel()
     irradiance = table[2 * members.patches]
     views = _views(members, irradiance)
     total, indirect = _importance(rays, blocks, cache, members, views)
@@ -94,7 +94,7 @@ def cache_noise(
     dr.eval(of_patches)
     # What is seen first gathers by rays of its own, as if it were patches.
     importance = (indirect + views).sum(axis=1)
-    coarse = coarseness(rays, blocks, cache, of_patches, importance, members)
+    coarse = coarseness(rays, blocks, table, of_patches, importance, members)
 
     # ---- Scatter within each block: rays k and k ^ step start in neighbouring directions ----
     step = 1 << (samples.bit_length() - 1) // 2
@@ -169,26 +169,46 @@ def _importance(rays, blocks, cache, members, views) -> tuple[np.ndarray, np.nda
     rays from there do. From patch to patch, importance flows against the light.
     """
     samples, n_patches = rays.samples, len(members.patches)
-    some = np.s_[: min(samples, ADJOINT_RAYS)]
+    some = _spread(samples, min(samples, ADJOINT_RAYS))
     weight, row = (
         x.numpy().reshape(-1, samples)[:, some] for x in (mean_channel(rays.weight), rays.row)
     )
+    rank_of_patch = np.full(cache.patches.count, n_patches)
+    rank_of_patch[members.patches] = np.arange(n_patches)
     rank = blocks.rank[:, None]
     weight = weight / (weight.shape[1] * blocks.count[rank])
-    place = row.ravel(), np.broadcast_to(rank, row.shape).ravel()
-    flow = csr_matrix((weight.ravel(), place), (2 * cache.patches.count, n_patches))
+    place = (
+        (2 * rank_of_patch[row >> 1] + (row & 1)).ravel(),
+        np.broadcast_to(rank, row.shape).ravel(),
+    )
+    flow = csr_matrix((weight.ravel(), place), (2 * n_patches + 2, n_patches))
 
     def of_patches(importance):
-        return importance.reshape(-1, 2, views.shape[1])[members.patches].transpose(1, 0, 2)
+        """Of their total and of their indirect irradiance; what follows stands for others."""
+        total, indirect = importance[: 2 * n_patches].reshape(n_patches, 2, -1).transpose(1, 0, 2)
+        return total, indirect
 
     asked = flow @ views
     importance = asked
     for _ in range(MAX_BOUNCES):
-        previous, importance = importance, asked + flow @ of_patches(importance).sum(axis=0)
+        previous, importance = importance, asked + flow @ sum(of_patches(importance))
         if np.abs(importance - previous).sum() <= CONVERGED * importance.sum():
             break
     total, of_indirect = of_patches(importance)
     return total, total + of_indirect
+
+
+def _spread(samples: int, count: int) -> np.ndarray:
+    """Numbers [count] of rays of a block that are spread as evenly as all: both powers of two.
+
+    Rays have the numbers k and the directions (k / samples, k with its bits reversed): one of each
+    ``samples / count`` in a row, each time another one, in the order of reversed bits.
+    """
+    step = samples // count
+    bits = max(step.bit_length() - 1, 0)
+    i = np.arange(count)
+    within = sum(((i >> b) & 1) << (bits - 1 - b) for b in range(bits))
+    return step * i + within
 
 
 def _block_sum(value: mi.Float, samples: int) -> np.ndarray:
