@@ -1,6 +1,6 @@
 """Which folders of the package import which, read from its source.
 
-``python -m tests.layers`` prints the picture that README.md shows.
+``python -m tests.layers`` prints the picture that the package's README.md shows.
 """
 
 from __future__ import annotations

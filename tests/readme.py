@@ -62,24 +62,38 @@ def _markdown(text: str) -> str:
     return re.sub(r":\w+:`([^`]*)`|``([^`]*)``", lambda m: f"`{m[1] or m[2]}`", text)
 
 
-def table(plugin: type) -> str:
-    """The parameters of a plugin in Markdown."""
-    lines = ["| parameter | type | default | meaning |", "|---|---|---|---|"]
-    lines += [
-        f"| `{p.name}` | {p.element} | {p.default} | {p.meaning} |" for p in documented(plugin)
-    ]
+def table(plugin: type, known: type | None = None) -> str:
+    """The parameters of a plugin in Markdown; of those that are ``known``, the names alone."""
+    elsewhere = documented(known) if known else []
+    own = [p for p in documented(plugin) if p not in elsewhere]
+    shared = [f"`{p.name}`" for p in documented(plugin) if p in elsewhere]
+    lines = ["| parameter | type | default | meaning |", "|---|---|---|---|"] if own else []
+    lines += [f"| `{p.name}` | {p.element} | {p.default} | {p.meaning} |" for p in own]
+    if shared:
+        lines += (
+            ["", f"As above: {', '.join(shared)}."] if own else [f"As above: {', '.join(shared)}."]
+        )
     return "\n".join(lines)
 
 
 def updated(readme: str) -> str:
     """The text of the README with every plugin's table between its two markers."""
-    for name, plugin in plugins().items():
+    found = plugins()
+    for name, plugin in found.items():
         begin, end = f"<!-- parameters of {name} -->\n", "<!-- end -->"
         head, marker, rest = readme.partition(begin)
         if not marker:
             raise ValueError(f'README.md has no line "{begin.strip()}"')
-        readme = head + begin + table(plugin) + "\n" + rest[rest.index(end) :]
+        readme = (
+            head + begin + table(plugin, _known(found, plugin)) + "\n" + rest[rest.index(end) :]
+        )
     return readme
+
+
+def _known(found: dict[str, type], plugin: type) -> type | None:
+    """What has been listed above a plugin."""
+    first = found["envmap_hybrid"]
+    return None if plugin is first else first
 
 
 if __name__ == "__main__":

@@ -20,18 +20,18 @@ from envmap_integrator.system.llvm import LLVMError, LLVMLibrary, ensure_llvm
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the diagnosis; ``mend`` says what to do if anything is amiss."""
+    """One line of the diagnosis; ``fix`` says what to do if anything is amiss."""
 
     subject: str
     finding: str
-    mend: str = ""
+    fix: str = ""
     fatal: bool = False
 
     @property
     def mark(self) -> str:
         if self.fatal:
             return "[bold red]✗[/]"
-        return "[yellow]•[/]" if self.mend else "[green]✓[/]"
+        return "[yellow]•[/]" if self.fix else "[green]✓[/]"
 
 
 def doctor(args: argparse.Namespace) -> int:
@@ -39,9 +39,9 @@ def doctor(args: argparse.Namespace) -> int:
     console = Console()
     findings = list(diagnose(console))
     for item in findings:
-        mend = f" [dim]→ {item.mend}[/]" if item.mend else ""
+        fix = f" [dim]→ {item.fix}[/]" if item.fix else ""
         console.print(
-            f"{item.mark} {item.subject}: {item.finding}{mend}", highlight=False, soft_wrap=True
+            f"{item.mark} {item.subject}: {item.finding}{fix}", highlight=False, soft_wrap=True
         )
     return int(any(item.fatal for item in findings))
 
@@ -62,14 +62,14 @@ def diagnose(console: Console) -> Iterator[Finding]:
     yield Finding(
         "variants",
         ", ".join(usable) or "none that our integrators work with",
-        mend="" if usable else "mend libLLVM above",
+        fix="" if usable else "fix libLLVM above",
         fatal=not usable,
     )
     denoiser = importlib.util.find_spec("mitsuba_oidn")
     yield Finding(
         "denoiser",
         "Open Image Denoise" if denoiser else "none (optional)",
-        mend="" if denoiser else "pip install mitsuba-oidn",
+        fix="" if denoiser else "pip install mitsuba-oidn",
     )
     terminal = "colours and progress bars" if console.is_terminal else "plain (not a terminal)"
     yield Finding("terminal", terminal)
@@ -95,5 +95,5 @@ def _llvm() -> LLVMLibrary | LLVMError:
 def _llvm_finding(llvm: LLVMLibrary | LLVMError, gpu: bool) -> Finding:
     if isinstance(llvm, LLVMLibrary):
         return Finding("libLLVM", str(llvm))
-    found, _, mend = str(llvm).rpartition(": ")
-    return Finding("libLLVM", found, mend, fatal=not gpu)
+    found, _, fix = str(llvm).rpartition(": ")
+    return Finding("libLLVM", found, fix, fatal=not gpu)

@@ -1,4 +1,4 @@
-"""Mitsuba's error messages, which span lines and name C++ files, as one line with a mend."""
+"""Mitsuba's errors, which span lines and name C++ files, as one line that says what to do."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ _CPP_LOCATION = re.compile(r"\[\w+\.(?:cpp|h):\d+\] ")
 #: What Python puts before the message of an exception that has come through C++.
 _PYTHON_TRACEBACK = re.compile(r"^.*?Traceback \(most recent call last\):.*\n\w*Error: ", re.DOTALL)
 
-_MENDS = (
+_FIXES = (
     (re.compile(r"Plugin \"[^\"]*\" not found"), "check its spelling, or pass --integrator NAME"),
     (re.compile(r"unreferenced propert"), "check the spelling, or remove it"),
     (re.compile(r"undefined parameter: \$(\w+)"), r"pass -D \1=VALUE"),
@@ -25,7 +25,7 @@ def condense(error: BaseException) -> str:
     text = _CPP_LOCATION.sub("", str(error)) or type(error).__name__
     text = _PYTHON_TRACEBACK.sub("", text)
     text = " ".join(text.split())
-    for pattern, mend in _MENDS:
+    for pattern, fix in _FIXES:
         if match := pattern.search(text):
-            return f"{text} ({match.expand(mend)})"
+            return f"{text} ({match.expand(fix)})"
     return text

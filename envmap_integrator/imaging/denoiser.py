@@ -12,7 +12,10 @@ GUIDE_SPP = 16
 
 
 def prepare_for_denoiser(integrator: mi.Integrator) -> bool:
-    """Have an integrator give the AOVs that help ``denoise``; whether it didn't, but does now."""
+    """Have an integrator give the AOVs that help ``denoise``.
+
+    Returns whether that has switched them on: they are to be taken off the picture afterwards.
+    """
     switched_on = getattr(integrator, "indirect_aovs", None) is False
     if switched_on:
         integrator.indirect_aovs = True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from operator import add
 
 import drjit as dr
@@ -10,6 +11,7 @@ import mitsuba as mi
 from ..system.interrupt import going_on
 from ..system.jit import give_back
 from ..system.progress import stage
+from ..transport.camera import CameraSample
 from ..transport.gathered import Gathered
 from .irradiance_filter import filter_irradiance, pixel_records, tolerance
 from .pixel_filter import PixelFilter
@@ -22,13 +24,24 @@ INDIRECT_AOVS = tuple(f"{name}.{c}" for name in ("indirect", "gathered", "albedo
 #: most, which is Dr.Jit's limit.
 MIN_LANES, MAX_LANES = 1 << 20, (1 << 32) - 1
 
+#: What finds the light of a sample: by a sampler, the ray, and the index of the sample.
+Shade = Callable[[mi.Sampler, mi.Ray3f, mi.UInt32], CameraSample]
+
 
 def most_samples(sensor: mi.Sensor) -> int:
     """Samples per pixel at most with Mitsuba's samplers, which need a lane for each."""
     return MAX_LANES // n_pixels_of(sensor.film())
 
 
-def expose(sensor, sampler, spp, seed, shade, names: list[str], aovs) -> None:
+def expose(
+    sensor: mi.Sensor,
+    sampler: mi.Sampler | None,
+    spp: int,
+    seed: int,
+    shade: Shade,
+    names: list[str],
+    aovs: Callable[[CameraSample], list[mi.Float]],
+) -> None:
     """Render to the film of a sensor.
 
     ``sampler`` is one of Mitsuba's, or None for our own sample points. ``shade(sampler, ray,
@@ -44,7 +57,15 @@ def expose(sensor, sampler, spp, seed, shade, names: list[str], aovs) -> None:
     _put(sensor, _accumulate(sensor, sampler, spp, seed, shade, channels, len(names)))
 
 
-def expose_gathered(sensor, sampler, spp, seed, shade, n_shared: int, with_aovs: bool) -> None:
+def expose_gathered(
+    sensor: mi.Sensor,
+    sampler: mi.Sampler | None,
+    spp: int,
+    seed: int,
+    shade: Shade,
+    n_shared: int,
+    with_aovs: bool,
+) -> None:
     """As ``expose``, with what surfaces gather taken apart and, if asked for, ``INDIRECT_AOVS``.
 
     Pixels share what they gather with ``n_shared`` rays each, unless that is 0.

@@ -62,13 +62,13 @@ class SamplePoints:
         self.index = self.index + 1
         self.dimension = mi.UInt32(0)
 
-    def next_1d(self, active=True) -> mi.Float:
+    def next_1d(self, active: mi.Bool | bool = True) -> mi.Float:
         """A number in [0, 1)."""
         shuffled, scramble, own = self._next()
         bits = dr.brev(_scrambled(shuffled, mix(scramble + _SECOND)))
         return unit(bits ^ (own >> self.strata))
 
-    def next_2d(self, active=True) -> mi.Point2f:
+    def next_2d(self, active: mi.Bool | bool = True) -> mi.Point2f:
         """A point in the unit square."""
         shuffled, scramble, own = self._next()
         scramble = mix(scramble + _SECOND)

@@ -20,12 +20,12 @@ def n_levels(resolution: int) -> int:
     return resolution.bit_length()
 
 
-def n_texels(resolution):
+def n_texels(resolution: int | mi.UInt32) -> int | mi.UInt32:
     """Texels of all six faces and all levels."""
     return 8 * resolution * resolution - 2
 
 
-def level_offset(resolution, level_resolution):
+def level_offset(resolution: int | mi.UInt32, level_resolution: int | mi.UInt32) -> int | mi.UInt32:
     """Index of the first texel of the level with the given resolution."""
     return 8 * (resolution * resolution - level_resolution * level_resolution)
 
@@ -72,7 +72,9 @@ def fold(face: mi.UInt32, uv: mi.Point2f, u: mi.Float) -> tuple[mi.UInt32, mi.Po
     return direction_to_face(face_to_direction(face, mi.Point2f(u_, v_), 1 - over.x - over.y))
 
 
-def texel(face: mi.UInt32, uv: mi.Point2f, resolution, level_resolution) -> mi.UInt32:
+def texel(
+    face: mi.UInt32, uv: mi.Point2f, resolution: mi.UInt32, level_resolution: mi.UInt32
+) -> mi.UInt32:
     """Index of the texel at (u, v) of a face, on the level with the given resolution."""
     last = level_resolution - 1
     size = mi.Float(level_resolution)
@@ -90,7 +92,9 @@ def solid_angles(resolution: int) -> np.ndarray:
     return corner[1:, 1:] - corner[1:, :-1] - corner[:-1, 1:] + corner[:-1, :-1]
 
 
-def exit_distance(centre: mi.Point3f, half_width: mi.Float, o: mi.Point3f, d: mi.Vector3f):
+def exit_distance(
+    centre: mi.Point3f, half_width: mi.Float, o: mi.Point3f, d: mi.Vector3f
+) -> mi.Float:
     """Distance along a ray from inside a cube to its surface; negative if ``o`` is outside."""
     towards = dr.select(d > 0, half_width, -half_width)
     # A component that doesn't move never leaves.

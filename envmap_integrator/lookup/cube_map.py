@@ -47,11 +47,12 @@ class CubeMap:
 
     @property
     def resolution(self) -> int:
+        """Texels along the edge of a face of the finest level."""
         return self.levels[0].shape[1]
 
     @property
     def n_channels(self) -> int:
-        """Of colour."""
+        """Number of colour channels C."""
         return self.levels[0].shape[-1] - 1
 
     @property

@@ -1,4 +1,4 @@
-"""Which source a shadow ray goes to, by what each is known to send to the place.
+"""Which emitter a shadow ray goes to, by what each is known to send to the place.
 
 The paper's source selection: with one choice for all places, most shadow rays of a room with
 several lamps are spent on those that hardly matter there.
@@ -40,7 +40,7 @@ class Emitters:
         table[registry_ids] = np.arange(self.count, dtype=np.uint32)
         self._table = upload(mi.UInt32, table)
 
-    def index(self, emitter: mi.EmitterPtr, active=True) -> mi.UInt32:
+    def index(self, emitter: mi.EmitterPtr, active: mi.Bool | bool = True) -> mi.UInt32:
         """Index of each emitter."""
         return dr.gather(mi.UInt32, self._table, dr.reinterpret_array(mi.UInt32, emitter), active)
 
@@ -67,8 +67,10 @@ class EmitterChoice:
         cell = dr.minimum(cell, dr.opaque(mi.UInt32, dr.width(self.row_of_cell) - 1))
         return dr.select(found, dr.gather(mi.UInt32, self.row_of_cell, cell, found), last)
 
-    def sample_direction(self, ref, row, u, active):
-        """Choose a source and a direction to it: ``(ds, weight)``, as Mitsuba's scene does.
+    def sample_direction(
+        self, ref: mi.Interaction3f, row: mi.UInt32, u: mi.Point2f, active: mi.Bool | bool
+    ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
+        """Choose an emitter and a direction to it: ``(ds, weight)``, as Mitsuba's scene does.
 
         Visibility isn't tested.
         """
@@ -89,7 +91,13 @@ class EmitterChoice:
         ds.pdf *= probability
         return ds, weight * dr.rcp(probability)
 
-    def pdf_direction(self, ref, row, ds, active):
+    def pdf_direction(
+        self,
+        ref: mi.Interaction3f,
+        row: mi.UInt32,
+        ds: mi.DirectionSample3f,
+        active: mi.Bool | bool,
+    ) -> mi.Float:
         """Density [1/sr] of ``sample_direction``."""
         n = self.emitters.size
         index = self.emitters.index(ds.emitter, active)

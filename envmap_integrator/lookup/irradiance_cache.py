@@ -23,7 +23,7 @@ class IrradianceCache:
     patches: Patches
     table: mi.Float
 
-    def irradiance(self, row: mi.UInt32, active=True) -> mi.Spectrum:
+    def irradiance(self, row: mi.UInt32, active: mi.Bool | bool = True) -> mi.Spectrum:
         """Irradiance [W/m²] in a row of the table."""
         return dr.gather(mi.Spectrum, self.table, row, active)
 

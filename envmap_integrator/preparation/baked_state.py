@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -123,7 +124,7 @@ class BakedState:
     cluster_of_cell: np.ndarray | None = None
     stage_times: dict[str, float] = field(default_factory=dict)
 
-    def save(self, path) -> None:
+    def save(self, path: str | os.PathLike) -> None:
         """Write the state to an OpenEXR file, for ``cache_file`` and ``mipmap_cube``."""
         save(path, self)
 
@@ -134,7 +135,7 @@ class BakedState:
 _WIDTH = 1024
 
 
-def save(path, prepared: BakedState) -> None:
+def save(path: str | os.PathLike, prepared: BakedState) -> None:
     """Write a prepared state to an OpenEXR file."""
     patches = prepared.cache.patches
     parts = {
@@ -171,7 +172,7 @@ def save(path, prepared: BakedState) -> None:
     write(path, parts, metadata)
 
 
-def load(path, key: StateKey, owner: str, n_emitters: int) -> BakedState:
+def load(path: str | os.PathLike, key: StateKey, owner: str, n_emitters: int) -> BakedState:
     """Read a prepared state; ``ValueError`` if the file holds none that belongs to ``key``.
 
     ``n_emitters`` is the number of emitters of the scene.

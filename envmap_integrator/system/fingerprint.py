@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from blake3 import blake3
 
 from .behaviour import behaviour
 
-#: Bytes that a thread hashes at a time.
-BLOCK = 1 << 22
 #: What the parts of a fingerprint stand for, in their order.
 PARTS = (
     "variant",
@@ -289,18 +286,14 @@ def _traits(item: mi.Object) -> Iterator[str]:
 
 
 def _digest(*parts: bytes) -> bytes:
-    digest = hashlib.blake2b(digest_size=16)
+    digest = blake3()
     for part in parts:
         digest.update(len(part).to_bytes(8, "little"))
         digest.update(part)
-    return digest.digest()
+    return digest.digest(length=16)
 
 
 def _array_digest(array) -> bytes:
-    """Hash of an array's content, block by block: by several threads if there are several."""
+    """Hash of an array's content."""
     data = np.ascontiguousarray(array.numpy()).reshape(-1).view(np.uint8)
-    blocks = [data[begin : begin + BLOCK] for begin in range(0, len(data), BLOCK)]
-    if len(blocks) <= 1:  # Handing a small array to a thread takes ten times as long as hashing it.
-        return _digest(*blocks)
-    with ThreadPoolExecutor() as pool:
-        return _digest(*pool.map(_digest, blocks))
+    return blake3(data).digest(length=16)

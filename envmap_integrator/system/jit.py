@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -30,19 +32,19 @@ def upload(dtype: type, values: np.ndarray) -> mi.Float | mi.UInt32:
     return dtype(aligned)
 
 
-def upload_vectors(dtype: type, values: np.ndarray):
+def upload_vectors(dtype: type, values: np.ndarray) -> mi.Vector3f:
     """A Dr.Jit array of vectors of the rows of NumPy values [N, 3]."""
     return dtype(*(upload(mi.Float, component) for component in values.T))
 
 
-def opaque_point(values) -> mi.Point3f:
+def opaque_point(values: Iterable[float]) -> mi.Point3f:
     """A point that kernels read as data: changing it compiles nothing."""
     point = mi.Point3f(*(float(value) for value in values))
     dr.make_opaque(point)
     return point
 
 
-def mean_channel(colour) -> mi.Float:
+def mean_channel(colour: mi.Spectrum) -> mi.Float:
     """Mean of the channels of colours; ``dr.mean`` puts the number of lanes into the kernel."""
     return dr.sum(colour) / len(colour)
 

@@ -140,14 +140,14 @@ def _explanation(version: tuple[int, ...]) -> str:
 
     best = next(iter(installed_libraries()), None)
     if best and best.usable:
-        mend = (
+        fix = (
             f"set {ENV_VARIABLE}={best.path}"
             if chosen
             else f"import envmap_integrator before mitsuba, or set {ENV_VARIABLE}={best.path}"
         )
     else:
-        mend = _install_hint()
-    return f"{found}, but the llvm_* variants need LLVM {MIN_VERSION} or newer: {mend}"
+        fix = _install_hint()
+    return f"{found}, but the llvm_* variants need LLVM {MIN_VERSION} or newer: {fix}"
 
 
 def _install_hint() -> str:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
+
+import psutil
 
 _ROOT = Path("/")
 
@@ -18,22 +19,8 @@ def check_memory(owner: str, what: str, needed: float, advice: str) -> None:
 
 
 def free_memory() -> float:
-    """Bytes that this process can still take, as far as the system says; infinite if it doesn't."""
-    return min(_of_machine(), *map(_of_group, _groups()))
-
-
-def _of_machine() -> float:
-    try:
-        for line in (_ROOT / "proc/meminfo").read_text().splitlines():
-            if line.startswith("MemAvailable:"):
-                return 1024.0 * int(line.split()[1])
-        return float("inf")
-    except OSError:  # Not Linux.
-        pass
-    try:
-        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    except (AttributeError, ValueError, OSError):
-        return float("inf")
+    """Bytes that this process can still take: of the machine, and of its control groups."""
+    return min(float(psutil.virtual_memory().available), *map(_of_group, _groups()))
 
 
 def _groups() -> list[Path]:

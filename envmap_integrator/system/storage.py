@@ -82,7 +82,7 @@ def _read(path: Path, made_by: str) -> Stored:
         _ask_for_memory(path.stat().st_size)
         content = path.read_bytes()
     except OSError as error:
-        reason = f"can't be read: {error.strerror}; mend that, or {made_by}"
+        reason = f"can't be read: {error.strerror}; fix that, or {made_by}"
         raise StorageError(f"{path}: {reason}") from error
     fault = _fault(content)
     if fault:

@@ -71,7 +71,14 @@ def camera_radiance(
 
 
 @dr.syntax
-def split(scene, lookup, rules, sampler, ray, active) -> CameraSample:
+def split(
+    scene: mi.Scene,
+    lookup: Lookup,
+    rules: PathRules,
+    sampler: mi.Sampler,
+    ray: mi.Ray3f,
+    active: mi.Bool,
+) -> CameraSample:
     """Shade the first surface that isn't a mirror or glass, and send secondary rays from it.
 
     This vertex stands outside the loop over the others also for a single secondary ray: it needs no
@@ -138,7 +145,13 @@ def split(scene, lookup, rules, sampler, ray, active) -> CameraSample:
 
 
 @dr.syntax
-def follow_mirrors(scene, sampler, si, ray, active):
+def follow_mirrors(
+    scene: mi.Scene,
+    sampler: mi.Sampler,
+    si: mi.SurfaceInteraction3f,
+    ray: mi.Ray3f,
+    active: mi.Bool,
+) -> tuple[mi.SurfaceInteraction3f, mi.Ray3f, mi.Spectrum, mi.Spectrum, mi.Bool]:
     """Follow perfect mirrors and glass to what is seen in them.
 
     Returns an interaction, invalid where nothing is seen, the ray to it, the throughput, what the
@@ -167,8 +180,18 @@ def follow_mirrors(scene, sampler, si, ray, active):
     return si, ray, throughput, emitted, solid
 
 
-def gathering(scene, si, bsdf, radiance, nearness, active) -> Gathered:
-    """What pixels may share of the ``radiance`` that the wide lobes of a surface reflect."""
+def gathering(
+    scene: mi.Scene,
+    si: mi.SurfaceInteraction3f,
+    bsdf: mi.BSDFPtr,
+    radiance: mi.Spectrum,
+    nearness: mi.Float,
+    active: mi.Bool,
+) -> Gathered:
+    """What pixels may share of the ``radiance`` [W/m²/sr] that the wide lobes of a surface reflect.
+
+    ``nearness`` [1/m] is the inverse distance to where that comes from.
+    """
     albedo = bsdf.eval_diffuse_reflectance(si, active)
     albedo += dr.select(single_lobe(bsdf), 0, GLOSS_ALBEDO)
     shared = active & is_diffuse(bsdf) & (dr.max(albedo) > 0)

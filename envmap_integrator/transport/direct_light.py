@@ -88,7 +88,15 @@ def sample_emitter(
 
 
 @dr.syntax
-def sample_emitters(scene, emitters, vertex, share, sampler, n, active) -> mi.Spectrum:
+def sample_emitters(
+    scene: mi.Scene,
+    emitters: EmitterChoice,
+    vertex: Vertex,
+    share: WideShare,
+    sampler: mi.Sampler,
+    n: mi.UInt32,
+    active: mi.Bool,
+) -> mi.Spectrum:
     """Direct light [W/m²/sr] reflected at a surface, by ``n`` stratified shadow rays of a lane."""
     result = mi.Spectrum(0)
     i = mi.UInt32(0)
@@ -103,7 +111,12 @@ def sample_emitters(scene, emitters, vertex, share, sampler, n, active) -> mi.Sp
 
 
 def sample_with_emitter(
-    scene, emitters, vertex, share, sampler, active
+    scene: mi.Scene,
+    emitters: EmitterChoice,
+    vertex: Vertex,
+    share: WideShare,
+    sampler: mi.Sampler,
+    active: mi.Bool,
 ) -> tuple[mi.Spectrum, mi.BSDFSample3f, mi.Spectrum]:
     """As ``sample_emitter``, and a direction sampled from the material, in a single call of it.
 

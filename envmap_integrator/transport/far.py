@@ -10,6 +10,7 @@ import mitsuba as mi
 from ..lookup.far_field import FarField
 from ..system.jit import SpareNumbers
 from ..system.ray_counts import Ray, count
+from .state import Path
 
 
 @dataclass
@@ -30,7 +31,7 @@ class Met:
     boost: mi.Float
 
 
-def near_alone(path, si: mi.SurfaceInteraction3f) -> Met:
+def near_alone(path: Path, si: mi.SurfaceInteraction3f) -> Met:
     """Without maps."""
     return Met(si, si, path.active & (si.t <= path.reach), mi.Spectrum(0), mi.Float(1))
 
@@ -38,7 +39,7 @@ def near_alone(path, si: mi.SurfaceInteraction3f) -> Met:
 def look_up_far(
     scene: mi.Scene,
     far_field: FarField,
-    path,
+    path: Path,
     si: mi.SurfaceInteraction3f,
     goes_on: mi.Bool,
     spare: SpareNumbers,

@@ -78,7 +78,13 @@ class Scattered:
 
 
 @dr.syntax
-def choose_lobes(bsdf, si, sampler, active, residual) -> tuple[mi.Spectrum, Scattered]:
+def choose_lobes(
+    bsdf: mi.BSDFPtr,
+    si: mi.SurfaceInteraction3f,
+    sampler: mi.Sampler,
+    active: mi.Bool,
+    residual: mi.Bool,
+) -> tuple[mi.Spectrum, Scattered]:
     """Sample a material ``LOBE_CHOICES`` times, stratified over its lobes.
 
     Returns the weight [1] of the wide lobes, for which the cache stands, and one direction for all

@@ -70,5 +70,7 @@ class PathRules:
 
 
 def as_baked(shadow_samples: int) -> PathRules:
-    """Of what maps hold (paper section 2): paths end in the cache at once, no emitter is seen."""
+    """Rules for what maps hold (paper section 2): paths end in the cache at once, and emitters that
+    they see at once don't count, as the renderer samples them.
+    """
     return PathRules(gather_depth=0, emission=False, shadow_samples=shadow_samples)

@@ -113,6 +113,7 @@ class Path:
 
     @staticmethod
     def begin(start: PathStart, rules: PathRules, active: mi.Bool) -> Path:
+        """A path at its start."""
         residual = rules.residual
         return Path(
             active=mi.Bool(active),

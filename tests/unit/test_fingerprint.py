@@ -277,7 +277,7 @@ def test_nothing_is_read_twice(monkeypatch):
     scene = load(textured_room())
     read = SceneFingerprint()
     before = read(scene)
-    monkeypatch.setattr("envmap_integrator.system.fingerprint.hashlib", None)
+    monkeypatch.setattr("envmap_integrator.system.fingerprint.blake3", None)
     assert read(scene) == before
 
 

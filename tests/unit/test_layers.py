@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from tests.layers import folder_imports, module_imports, order, picture
-from tests.readme import README
+from tests.layers import PACKAGE, folder_imports, module_imports, order, picture
 
 
 def test_imports_of_modules_and_folders_have_no_circles():
@@ -16,4 +15,6 @@ def test_imports_of_modules_and_folders_have_no_circles():
 
 
 def test_readme_shows_imports():
-    assert picture(folder_imports(module_imports())) in README.read_text(encoding="utf-8")
+    assert picture(folder_imports(module_imports())) in (PACKAGE / "README.md").read_text(
+        encoding="utf-8"
+    )

@@ -104,7 +104,9 @@ def _no_patches() -> Patches:
     return Patches(origin, size, levels=bucket, cells=mi.UInt32(bucket), use_objects=False)
 
 
-def cell_keys(patches: Patches, position, identity, level) -> np.ndarray:
+def cell_keys(
+    patches: Patches, position: mi.Point3f, identity: mi.UInt32, level: mi.UInt32
+) -> np.ndarray:
     """Slot and fingerprint [N] of the cells of points, in one word."""
     scale = mi.Float(mi.UInt32(1) << level) / patches.size
     cell = mi.Vector3i(dr.floor((position - patches.origin) * scale))

@@ -116,6 +116,7 @@ class SurfacePoints:
 
     @staticmethod
     def concatenate(parts: list[SurfacePoints]) -> SurfacePoints:
+        """All points of several batches."""
         return SurfacePoints(
             *(
                 np.concatenate([getattr(part, name) for part in parts])

@@ -37,7 +37,7 @@ class Service:
 
 
 UNKNOWN = Service(1.0, 1e30)
-"""Of a mesh that was made for no view: none is served as well."""
+"""What a mesh that was made for no view does for it: no view is served as well."""
 
 
 def view_name(sensor: mi.Sensor) -> str:

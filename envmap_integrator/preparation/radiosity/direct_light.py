@@ -27,7 +27,7 @@ RAYS_PER_EMITTER = 8
 
 @dataclass(frozen=True)
 class DirectLight:
-    """Samples of the irradiance from sources at surface points of K patches, N of each.
+    """Samples of the irradiance from emitters at surface points of K patches, N of each.
 
     members      the patches and their surface points
     irradiance   [K * N]  W/m², mean of the colour channels, over the probability of the emitter
@@ -151,8 +151,14 @@ def _surroundings(mesh: CoarseMesh, index: np.ndarray):
         yield np.unique(keys, return_inverse=True)[1]
 
 
-def sample_irradiance(scene, choice, si, row, u):
-    """One sample of the irradiance [W/m²] from sources at a point: ``(ds, irradiance)``."""
+def sample_irradiance(
+    scene: mi.Scene,
+    choice: EmitterChoice,
+    si: mi.SurfaceInteraction3f,
+    row: mi.UInt32,
+    u: mi.Point2f,
+) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
+    """One sample of the irradiance [W/m²] from emitters at a point: ``(ds, irradiance)``."""
     ds, weight = choice.sample_direction(si, row, u, True)
     cosine = dr.maximum(dr.dot(si.sh_frame.n, ds.d), 0)
     light = weight * dr.select(dr.dot(si.n, ds.d) > 0, cosine, 0)
@@ -163,6 +169,6 @@ def sample_irradiance(scene, choice, si, row, u):
     return ds, dr.select(active, light, 0)
 
 
-def finite(x):
+def finite(x: mi.Float) -> mi.Float:
     """Zero in place of infinities and NaN, which degenerate geometry may bring."""
     return dr.select(dr.isfinite(x), x, 0)

@@ -36,7 +36,7 @@ class GatherRays:
     """What blocks of gather rays have found, ``samples`` N in each of B blocks.
 
     rank             [B]      place in ``PatchPoints.patches`` of the patch a block belongs to
-    direct, escaped  [B]      W/m²: irradiance from sources, and π b, the indirect light that comes
+    direct, escaped  [B]      W/m²: irradiance from emitters, and π b, the indirect light that comes
                               from no patch; means over the rays
     of_emitters, of_others [N * B]  W/m²: the same of each ray, mean of the colour channels
     weight           [N * B]  throughput with which a ray ends in a patch,
@@ -65,6 +65,7 @@ class GatherRays:
 
     @staticmethod
     def concatenate(parts: list[GatherRays]) -> GatherRays:
+        """All blocks of several batches."""
         if len(parts) == 1:
             return parts[0]
         names = (field.name for field in fields(GatherRays))
@@ -127,7 +128,7 @@ def gather(
     return GatherRays.concatenate(found)
 
 
-def block_mean(value: mi.Spectrum | mi.Float, samples: int):
+def block_mean(value: mi.Spectrum | mi.Float, samples: int) -> mi.Spectrum | mi.Float:
     """Means over the rays of each block."""
     if dr.depth_v(value) == 1:
         return dr.block_sum(value, samples) / samples
@@ -158,7 +159,7 @@ def _gather(scene, lookup, members, parts, rank, samples, seed) -> GatherRays:
     pdf = mi.warp.square_to_cosine_hemisphere_pdf(wo)
     direction = si.to_world(wo)
 
-    # ---- Direct light, by shadow rays and by the gather rays that hit a source ----
+    # ---- Direct light, by shadow rays and by the gather rays that hit an emitter ----
     emitter_row = lookup.emitters.row(
         dr.gather(mi.UInt32, upload(mi.UInt32, members.cells), member), True
     )
