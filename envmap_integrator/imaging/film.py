@@ -8,7 +8,7 @@ from operator import add
 import drjit as dr
 import mitsuba as mi
 
-from ..system.interrupt import going_on
+from ..system.interrupt import not_interrupted
 from ..system.jit import give_back
 from ..system.progress import stage
 from ..transport.camera import CameraSample
@@ -158,7 +158,7 @@ def _sums(values, points, pixel, end, sums):
     while dr.hint(going, label="Samples of a pixel"):
         sums = [*map(add, sums, values(points, pixel, points.index))]
         points.advance()
-        going &= (points.index < end) & going_on(points.index)
+        going &= (points.index < end) & not_interrupted(points.index)
     return sums
 
 
@@ -178,7 +178,7 @@ def _lane_per_sample(values, n_pixels, spp, seed, n_channels, sampler):
     def leave(sampler, index):
         return sampler, index
 
-    dr.if_stmt((sampler, index), going_on(index), trace, leave, mode="symbolic")
+    dr.if_stmt((sampler, index), not_interrupted(index), trace, leave, mode="symbolic")
     return sums
 
 

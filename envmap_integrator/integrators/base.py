@@ -14,6 +14,7 @@ from ..imaging.film import (
     rgb,
 )
 from ..lookup.far_field import FarField
+from ..lookup.lookup import Lookup
 from ..preparation.baked_state import BakedState, Settings, StateKey, load
 from ..preparation.coarse_mesh.views import service, view_name
 from ..preparation.pipeline import prepare
@@ -78,11 +79,12 @@ class CachedIntegrator(mi.SamplingIntegrator):
         """How paths go; ``seed`` is that of a pass over the picture."""
         raise NotImplementedError
 
-    def far_field(self, scene: mi.Scene, baked: BakedState, spp: int) -> FarField | None:
+    def maps_for(self, scene: mi.Scene, baked: BakedState, spp: int) -> FarField | None:
         """The maps, if there are any; ``spp`` samples share a pixel."""
         return None
 
     def aov_names(self) -> list[str]:
+        """Names of the channels that the film holds besides those of every film."""
         return []
 
     def aovs(self, found: CameraSample) -> list[mi.Float]:
@@ -200,8 +202,8 @@ class CachedIntegrator(mi.SamplingIntegrator):
                 dr.eval(picture)
         return picture
 
-    def _lookup(self, scene, baked: BakedState, spp: int):
-        return self._scenes(scene).lookup(baked, self.far_field(scene, baked, spp))
+    def _lookup(self, scene, baked: BakedState, spp: int) -> Lookup:
+        return self._scenes(scene).lookup(baked, self.maps_for(scene, baked, spp))
 
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
         self._refuse_gradients()

@@ -8,7 +8,6 @@ import mitsuba as mi
 
 from ..emitters.mipmap_cube import MipmapCube
 from ..lookup.cube_map import MAX_RESOLUTION
-from ..lookup.far_field import far_field
 from ..system.parameters import Parameters
 from .base import GatheringIntegrator
 from .envmap_bake import EnvmapBake
@@ -151,7 +150,6 @@ class EnvmapHybrid(GatheringIntegrator):
                 )
         self.requests = tuple(requests)
         self.baker = self.baker or mi.load_dict({"type": "envmap_bake"})
-        self._far_field: tuple | None = None
 
     def settings(self):
         return super().settings(
@@ -172,23 +170,12 @@ class EnvmapHybrid(GatheringIntegrator):
             shadow_rays=self.second_hit == "shadow_rays",
         )
 
-    def far_field(self, scene, baked, spp):
-        """Uploaded once for a baked state and sample count."""
-        if not baked.maps:
-            return None
-        held = self._scenes(scene), baked
-        n_samples = spp * self.secondary_samples
-        key = (*map(id, held), n_samples, self.mip_bias, self.lookup, self.mirrors)
-        if self._far_field is None or self._far_field[0] != key:
-            found = far_field(
-                scene,
-                baked.maps,
-                baked.cluster_of_cell,
-                n_samples,
-                self.mip_bias,
-                corrected=self.lookup == "corrected",
-                map_mirrors=self.mirrors == "map",
-            )
-            # Nothing else gets the address of what is held on to.
-            self._far_field = key, found, held
-        return self._far_field[1]
+    def maps_for(self, scene, baked, spp):
+        return self._scenes(scene).maps(
+            scene,
+            baked,
+            spp * self.secondary_samples,
+            self.mip_bias,
+            corrected=self.lookup == "corrected",
+            map_mirrors=self.mirrors == "map",
+        )

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import mitsuba as mi
 
 from ..lookup.emitter_choice import EmitterChoice, Emitters
-from ..lookup.far_field import FarField
+from ..lookup.far_field import FarField, far_field
 from ..lookup.ids import ObjectIds
 from ..lookup.lookup import Lookup
 from ..system.fingerprint import SceneContent, SceneFingerprint
 from .baked_state import BakedState
 
 
-@dataclass(frozen=True)
 class SceneState:
     """A scene as it is now, and how kernels tell its objects apart.
 
@@ -27,15 +24,31 @@ class SceneState:
     emitters      its emitters
     """
 
-    content: SceneContent
-    fingerprint: str
-    ids: ObjectIds
-    emitters: Emitters
+    def __init__(self, scene: mi.Scene, content: SceneContent, fingerprint: str):
+        self.content, self.fingerprint = content, fingerprint
+        self.ids, self.emitters = ObjectIds(scene), Emitters(scene)
+        self._maps: tuple[BakedState, tuple, FarField] | None = None
 
-    def lookup(self, baked: BakedState, far_field: FarField | None) -> Lookup:
+    def lookup(self, baked: BakedState, maps: FarField | None) -> Lookup:
         """What paths look up in the scene, once it has been prepared."""
         choice = EmitterChoice(self.emitters, baked.emitter_table, baked.emitter_rows)
-        return Lookup(baked.cache.patches, self.ids, choice, baked.cache, far_field)
+        return Lookup(baked.cache.patches, self.ids, choice, baked.cache, maps)
+
+    def maps(
+        self,
+        scene: mi.Scene,
+        baked: BakedState,
+        n_samples: int,
+        mip_bias: float,
+        corrected: bool,
+        map_mirrors: bool,
+    ) -> FarField | None:
+        """Its maps where kernels read them, uploaded once: see ``far_field``."""
+        settings = n_samples, mip_bias, corrected, map_mirrors
+        if self._maps is None or self._maps[0] is not baked or self._maps[1] != settings:
+            found = far_field(scene, baked.maps, baked.cluster_of_cell, *settings)
+            self._maps = baked, settings, found
+        return self._maps[2]
 
 
 class SceneStates:
@@ -50,5 +63,5 @@ class SceneStates:
         content = SceneContent(scene)
         if self._last is None or self._last.content != content:
             fingerprint = self._fingerprint.of(content)
-            self._last = SceneState(content, fingerprint, ObjectIds(scene), Emitters(scene))
+            self._last = SceneState(scene, content, fingerprint)
         return self._last

@@ -26,7 +26,7 @@ _memory = np.zeros(64, np.uint32)
 
 @contextmanager
 def interruptible(otherwise: Callable[[], None] | None = None) -> Iterator[None]:
-    """In the block, lanes of kernels that ask ``going_on()`` learn of Ctrl-C.
+    """In the block, lanes of kernels that ask ``not_interrupted()`` learn of Ctrl-C.
 
     The block ends in ``KeyboardInterrupt`` as soon as the kernel has ended; what a kernel computes
     that has been stopped is worthless. ``otherwise()`` is called, in another thread, if the block
@@ -77,7 +77,7 @@ def _watch(reader, outer, pressed, left, otherwise) -> None:
             otherwise()
 
 
-def going_on(step: mi.UInt32) -> mi.Bool:
+def not_interrupted(step: mi.UInt32) -> mi.Bool:
     """Whether Ctrl-C hasn't been pressed, as kernels see it while they run.
 
     ``step`` counts what the kernel repeats: without it, the compiler would look once and for all.

@@ -43,7 +43,7 @@ def serve(
     start: PathStart,
     path: Path,
     vertex: Vertex,
-    goes_on: mi.Bool,
+    estimates: mi.Bool,
     spare: SpareNumbers,
 ) -> Service:
     """Ask the cache what it does at a surface.
@@ -66,8 +66,8 @@ def serve(
     # Total irradiance stands for direct light too: single shadow rays beside a lamp are noisy. But
     # where it changes within patches, a ray knows better.
     lit = mi.Bool(False) if rules.shadow_rays else could & patch.even & (path.depth > 0)
-    residual, served = could & goes_on, could & ~goes_on
-    boost = dr.select(residual, dr.rcp(path.going_on), 1)
+    residual, served = could & estimates, could & ~estimates
+    boost = dr.select(residual, dr.rcp(path.q), 1)
     share = WideShare(
         lit=lit & served, alone=could & ~(residual & lit), boost=dr.select(lit, boost, 1)
     )
@@ -122,6 +122,6 @@ def end_in_cache(
         scattered.weight *= dr.select(residual, service.boost, 1)
         # Later residuals count less by the albedo, and deserve as much less effort.
         less = dr.max(scattered.weight) / service.boost
-        path.going_on[residual] = dr.clip(less, 0.1, 1)
+        path.q[residual] = dr.clip(less, 0.1, 1)
     irradiance = lookup.cache.irradiance(service.row, dr.any(weight != 0))
     return weight * irradiance * dr.inv_pi, scattered, ends

@@ -41,7 +41,7 @@ def look_up_far(
     far_field: FarField,
     path: Path,
     si: mi.SurfaceInteraction3f,
-    goes_on: mi.Bool,
+    estimates: mi.Bool,
     spare: SpareNumbers,
 ) -> Met:
     """Read the map where paths have left their cube without a hit (paper section 2).
@@ -61,13 +61,13 @@ def look_up_far(
         spare.next_2d(),
         left,
     )
-    read, residual = left & trusted, left & trusted & goes_on
-    share = dr.select(residual, 1 - dr.rcp(path.going_on), 1)
+    read, residual = left & trusted, left & trusted & estimates
+    share = dr.select(residual, 1 - dr.rcp(path.q), 1)
     radiance = dr.select(read, path.throughput * share * radiance, 0)
 
     # ---------------------- Trace on ----------------------
 
-    traced_on = left & (~trusted | goes_on)
+    traced_on = left & (~trusted | estimates)
     beyond = mi.Ray3f(ray(ray.maxt), ray.d)
     count(Ray.RETRACED, beyond, traced_on)
     further = scene.ray_intersect(beyond, traced_on)
@@ -83,6 +83,6 @@ def look_up_far(
         far_si, visible = far_field.intersect_emitters(scene, beyond, searching)
         emitter_si = dr.select(searching, far_si, si)
         counts |= visible
-    boost = dr.select(residual, dr.rcp(path.going_on), 1)
-    path.going_on[residual] = 1
+    boost = dr.select(residual, dr.rcp(path.q), 1)
+    path.q[residual] = 1
     return Met(si, emitter_si, counts, radiance, boost)

@@ -47,7 +47,7 @@ def follow(
     _count_first(start, path)
     while dr.hint(path.active, exclude=[lookup, rules, start], label="Trace near, look up far"):
         spare = SpareNumbers(sampler.next_1d())
-        goes_on = _goes_on(rules, path)
+        estimates = _estimates(rules, path)
 
         # ---------------------- Trace near, look up far ----------------------
 
@@ -58,7 +58,7 @@ def follow(
         if dr.hint(lookup.far_field is None, mode="scalar"):
             met = near_alone(path, si)
         else:
-            met = look_up_far(scene, lookup.far_field, path, si, goes_on, spare)
+            met = look_up_far(scene, lookup.far_field, path, si, estimates, spare)
         found.radiance += met.radiance
 
         # ---------------------- Emitters hit ----------------------
@@ -71,7 +71,7 @@ def follow(
         # ---------------------- Direct light ----------------------
 
         vertex = Vertex.met(lookup, met.si, path.ray, path.active)
-        service = serve(lookup, rules, start, path, vertex, goes_on, spare)
+        service = serve(lookup, rules, start, path, vertex, estimates, spare)
         light, scattered = direct_light(scene, lookup, rules, sampler, path, vertex, service)
         found.radiance += path.throughput * light
 
@@ -99,11 +99,11 @@ def _count_first(start: PathStart, path: Path) -> None:
         count_secondary(path.ray, path.bounded, path.active)
 
 
-def _goes_on(rules: PathRules, path: Path) -> mi.Bool:
+def _estimates(rules: PathRules, path: Path) -> mi.Bool:
     """Whether paths go on where they could end, to estimate what is wrong with that."""
     if rules.residual is None:
         return mi.Bool(False)
-    return path.active & (rules.residual.decision(path.lane, path.bounces) < path.going_on)
+    return path.active & (rules.residual.decision(path.lane, path.bounces) < path.q)
 
 
 # ---------------------- Stages ----------------------

@@ -91,7 +91,7 @@ class Path:
     bounded, cluster     whether the ray ends where it leaves the cube of a cluster
     reach                distance beyond which emitters that are hit have been counted
     throughput, eta      β [1], and the relative index of refraction so far
-    going_on             probability of going on where the cache or a map could end the path
+    q                    probability of going on where the cache or a map could end the path
     lane                 number of the lane
     """
 
@@ -108,7 +108,7 @@ class Path:
     reach: mi.Float
     throughput: mi.Spectrum
     eta: mi.Float
-    going_on: mi.Float
+    q: mi.Float
     lane: mi.UInt32
 
     @staticmethod
@@ -129,7 +129,7 @@ class Path:
             reach=mi.Float(start.reach),
             throughput=mi.Spectrum(1),
             eta=mi.Float(1),
-            going_on=mi.Float(0) if residual is None else mi.Float(residual.probability),
+            q=mi.Float(0) if residual is None else mi.Float(residual.probability),
             lane=dr.arange(mi.UInt32, dr.width(start.ray)),
         )
 
