@@ -46,10 +46,7 @@ def serve(
     estimates: mi.Bool,
     spare: SpareNumbers,
 ) -> Service:
-    """Ask the cache what it does at a surface.
-
-    (So many parameters, as each stage takes what it reads and no more.)
-    """
+    """Ask the cache what it does at a surface."""
     si = vertex.si
     deep = is_diffuse(vertex.bsdf) & (path.depth >= rules.gather_depth)
     patch = lookup.patches.find(
@@ -105,7 +102,6 @@ def end_in_cache(
 
     Returns the light [W/m²/sr] that it brings, where the path goes on, and whether it ends. Of
     several lobes one that the cache can't stand for is followed.
-    (So many parameters, as each stage takes what it reads and no more.)
     """
     residual = service.residual
     asked = service.served | residual

@@ -128,10 +128,7 @@ def emitted_light(
     met: Met,
     found: PathEnd,
 ) -> mi.Spectrum:
-    """Light [W/m²/sr] of emitters that rays have hit, as far as shadow rays haven't brought it.
-
-    (So many parameters, as each stage takes what it reads and no more.)
-    """
+    """Light [W/m²/sr] of emitters that rays have hit, as far as shadow rays haven't brought it."""
     counts = met.counts
     if not rules.emission or (rules.hide_emitters and start.primary):
         counts &= path.bounces > 0
@@ -154,10 +151,7 @@ def direct_light(
     vertex: Vertex,
     service: Service,
 ) -> tuple[mi.Spectrum, Scattered]:
-    """Direct light [W/m²/sr] by shadow rays, and the direction that the material has sampled.
-
-    (So many parameters, as each stage takes what it reads and no more.)
-    """
+    """Direct light [W/m²/sr] by shadow rays, and the direction that the material has sampled."""
     share, si = service.share, vertex.si
     active = vertex.smooth & ~(share.lit & only_wide(vertex.bsdf))
     if rules.shadow_samples > 1:
