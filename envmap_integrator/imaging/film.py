@@ -24,8 +24,8 @@ INDIRECT_AOVS = tuple(f"{name}.{c}" for name in ("indirect", "gathered", "albedo
 #: most, which is Dr.Jit's limit.
 MIN_LANES, MAX_LANES = 1 << 20, (1 << 32) - 1
 
-#: What finds the light of a sample: by a sampler, the ray, and the index of the sample.
-Shade = Callable[[mi.Sampler, mi.Ray3f, mi.UInt32], CameraSample]
+#: What finds the light of a sample: takes a sampler, the ray, and the index of the sample.
+Shade = Callable[..., CameraSample]
 
 
 def most_samples(sensor: mi.Sensor) -> int:
