@@ -74,11 +74,13 @@ class MipmapCube(mi.Emitter):
 
     # ---------------------- Evaluation ----------------------
 
-    def eval(self, si, active=True):
+    def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool | bool = True) -> mi.Spectrum:
         """Radiance [W/m²/sr] that arrives from ``-si.wi``, at the emitter's level."""
         return self.eval_level(-si.wi, self.level, active)
 
-    def eval_level(self, direction, level: float, active=True) -> mi.Spectrum:
+    def eval_level(
+        self, direction: mi.Vector3f, level: float, active: mi.Bool | bool = True
+    ) -> mi.Spectrum:
         """Radiance [W/m²/sr] from world space directions at any level, trilinearly filtered."""
         self._require_map()
         top = len(self.cube_map.levels) - 1
@@ -89,7 +91,10 @@ class MipmapCube(mi.Emitter):
             value = dr.lerp(value, self._bilinear(direction, fine + 1, active), level - fine)
         return value
 
-    def sample_direction(self, it, sample, active=True):
+    def sample_direction(
+        self, it: mi.Interaction3f, sample: mi.Point2f, active: mi.Bool | bool = True
+    ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
+        """A direction in proportion to the radiance of the emitter's level, and its weight."""
         self._require_map()
         index, remapped, _ = self._distribution.sample_reuse_pmf(sample.x, active)
         resolution = self._sampling_resolution
@@ -110,13 +115,20 @@ class MipmapCube(mi.Emitter):
         value = self.eval_level(d, self.level, active)
         return ds, dr.select(ds.pdf > 0, value / ds.pdf, 0) & active
 
-    def pdf_direction(self, it, ds, active=True):
+    def pdf_direction(
+        self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool | bool = True
+    ) -> mi.Float:
+        """Density [1/sr] of ``sample_direction``."""
         return self._pdf(ds.d, active)
 
-    def eval_direction(self, it, ds, active=True):
+    def eval_direction(
+        self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool | bool = True
+    ) -> mi.Spectrum:
+        """Radiance [W/m²/sr] from a direction."""
         return self.eval_level(ds.d, self.level, active)
 
-    def to_string(self):
+    def to_string(self) -> str:
+        """What it is, for messages."""
         return f"MipmapCube[request={self.request}]"
 
     # ---------------------- Internals ----------------------

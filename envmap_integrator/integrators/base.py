@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from ..imaging.film import (
     INDIRECT_AOVS,
+    Shade,
     expose,
     expose_gathered,
     most_samples,
@@ -91,11 +92,19 @@ class CachedIntegrator(mi.SamplingIntegrator):
         """Values of ``aov_names``."""
         return []
 
-    def expose(self, sensor, sampler, spp, seed, shade) -> None:
+    def expose(
+        self,
+        sensor: mi.Sensor,
+        sampler: mi.Sampler | None,
+        spp: int,
+        seed: int,
+        shade: Shade,
+    ) -> None:
         """Render to the film of a sensor, as ``imaging.film.expose`` does."""
         expose(sensor, sampler, spp, seed, shade, self.aov_names(), self.aovs)
 
-    def to_string(self):
+    def to_string(self) -> str:
+        """Its parameters, for messages and the metadata of pictures."""
         parameters = {
             name: value
             for name, value in vars(self).items()
@@ -181,7 +190,19 @@ class CachedIntegrator(mi.SamplingIntegrator):
 
     # ---------------------- Rendering ----------------------
 
-    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+    def render(
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor | int = 0,
+        seed: int = 0,
+        spp: int = 0,
+        develop: bool = True,
+        evaluate: bool = True,
+    ) -> mi.TensorXf:
+        """Render a sensor of the scene, or another one, to its film, as Mitsuba's integrators do.
+
+        Raises ``ValueError`` as ``prepare`` does, and for more samples than ``sampler`` takes.
+        """
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
         baked = self.prepare(scene, sensor, spp)
@@ -205,10 +226,12 @@ class CachedIntegrator(mi.SamplingIntegrator):
     def _lookup(self, scene, baked: BakedState, spp: int) -> Lookup:
         return self._scenes(scene).lookup(baked, self.maps_for(scene, baked, spp))
 
-    def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+    def render_forward(self, scene, params, sensor=0, seed=0, spp=0) -> None:
+        """Raises ``NotImplementedError``."""
         self._refuse_gradients()
 
-    def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+    def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0) -> None:
+        """Raises ``NotImplementedError``."""
         self._refuse_gradients()
 
     def _refuse_gradients(self):
@@ -237,7 +260,15 @@ class CachedIntegrator(mi.SamplingIntegrator):
             )
         return sampler, spp
 
-    def sample(self, scene, sampler, ray, medium=None, active=True):
+    def sample(
+        self,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        ray: mi.RayDifferential3f,
+        medium: mi.Medium | None = None,
+        active: mi.Bool | bool = True,
+    ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
+        """Radiance [W/m²/sr], validity and AOVs of rays, within another integrator."""
         if not scene.sensors():
             raise ValueError(
                 f"{self.owner}: within another integrator only sensors of the scene are known, and "
@@ -265,7 +296,7 @@ class GatheringIntegrator(CachedIntegrator):
         self.indirect_aovs = parameters.flag("indirect_aovs", False)
         self.clamp_indirect = parameters.number("clamp_indirect", 0.0, 0.0)
 
-    def rules(self, seed):
+    def rules(self, seed: int) -> PathRules:
         residual = None
         if self.residual_probability > 0:
             residual = Residual(
@@ -281,17 +312,17 @@ class GatheringIntegrator(CachedIntegrator):
             clamp=dr.opaque(mi.Float, self.clamp_indirect) if self.clamp_indirect else None,
         )
 
-    def expose(self, sensor, sampler, spp, seed, shade):
+    def expose(self, sensor, sampler, spp, seed, shade) -> None:
         shared = self.irradiance_filter and self.residual_probability == 0
         if not (shared or self.indirect_aovs):
             return super().expose(sensor, sampler, spp, seed, shade)
         n_shared = spp * self.secondary_samples if shared else 0
         expose_gathered(sensor, sampler, spp, seed, shade, n_shared, self.indirect_aovs)
 
-    def aov_names(self):
+    def aov_names(self) -> list[str]:
         return list(INDIRECT_AOVS) if self.indirect_aovs else []
 
-    def aovs(self, found):
+    def aovs(self, found: CameraSample) -> list[mi.Float]:
         if not self.indirect_aovs:
             return []
         gathered = found.gathered

@@ -6,7 +6,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ..system.parameters import Parameters
-from ..transport.rules import as_baked
+from ..transport.camera import CameraSample
+from ..transport.rules import PathRules, as_baked
 from .base import CachedIntegrator
 
 
@@ -59,11 +60,11 @@ class EnvmapBake(CachedIntegrator):
         super().__init__(props)
         self.samples = Parameters(props).power_of_two("samples", 8, 1, 1 << 12)
 
-    def rules(self, seed):
+    def rules(self, seed: int) -> PathRules:
         return as_baked(self.shadow_samples)
 
-    def aov_names(self):
+    def aov_names(self) -> list[str]:
         return ["distance"]
 
-    def aovs(self, found):
+    def aovs(self, found: CameraSample) -> list[mi.Float]:
         return [dr.select(found.valid, found.distance, 0)]

@@ -8,7 +8,10 @@ import mitsuba as mi
 
 from ..emitters.mipmap_cube import MipmapCube
 from ..lookup.cube_map import MAX_RESOLUTION
+from ..lookup.far_field import FarField
+from ..preparation.baked_state import BakedState, Settings
 from ..system.parameters import Parameters
+from ..transport.rules import PathRules
 from .base import GatheringIntegrator
 from .envmap_bake import EnvmapBake
 
@@ -151,7 +154,7 @@ class EnvmapHybrid(GatheringIntegrator):
         self.requests = tuple(requests)
         self.baker = self.baker or mi.load_dict({"type": "envmap_bake"})
 
-    def settings(self):
+    def settings(self) -> Settings:
         return super().settings(
             maps=True,
             map_resolution=self.map_resolution,
@@ -163,14 +166,14 @@ class EnvmapHybrid(GatheringIntegrator):
             requests=self.requests,
         )
 
-    def rules(self, seed):
+    def rules(self, seed: int) -> PathRules:
         return replace(
             super().rules(seed),
             gather_depth=self.gather_depth,
             shadow_rays=self.second_hit == "shadow_rays",
         )
 
-    def maps_for(self, scene, baked, spp):
+    def maps_for(self, scene: mi.Scene, baked: BakedState, spp: int) -> FarField | None:
         return self._scenes(scene).maps(
             scene,
             baked,

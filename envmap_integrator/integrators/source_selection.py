@@ -42,7 +42,7 @@ class SourceSelection(CachedIntegrator):
     LEAST_PATCH_SAMPLES = 128
     """The cache is looked at directly, and its noise with it."""
 
-    def rules(self, seed):
+    def rules(self, seed: int) -> PathRules:
         return PathRules(
             gather_depth=0, shadow_samples=self.shadow_samples, hide_emitters=self.hide_emitters
         )

@@ -72,10 +72,12 @@ class SpareNumbers:
         self._count = 0
 
     def next_1d(self) -> mi.Float:
+        """A number in [0, 1)."""
         self._count += 1
         return unit(mix(self._bits + self._count * 0x9E3779B1 % 2**32))
 
     def next_2d(self) -> mi.Point2f:
+        """A point in the unit square."""
         return mi.Point2f(self.next_1d(), self.next_1d())
 
 

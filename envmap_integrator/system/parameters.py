@@ -20,6 +20,7 @@ class Parameters:
     def integer(
         self, name: str, default: int | None, low: int, high: int = 2**31 - 1
     ) -> int | None:
+        """An integer of ``low`` to ``high``; None if it isn't given and there is no default."""
         if default is None and name not in self._props:
             return None
         value = self._props.get(name, default)
@@ -28,6 +29,7 @@ class Parameters:
         return self._in_range(name, value, low, high)
 
     def power_of_two(self, name: str, default: int | None, low: int, high: int) -> int | None:
+        """A power of two of ``low`` to ``high``, or None likewise."""
         value = self.integer(name, default, low, high)
         if value is not None and value & (value - 1):
             raise ValueError(f'{self.owner}: "{name}" must be a power of two, not {value}')
@@ -36,6 +38,7 @@ class Parameters:
     def number(
         self, name: str, default: float | None, low: float, high: float = math.inf
     ) -> float | None:
+        """A finite number of ``low`` to ``high``, or None likewise."""
         if default is None and name not in self._props:
             return None
         value = self._props.get(name, default)
@@ -44,12 +47,14 @@ class Parameters:
         return float(self._in_range(name, value, low, high))
 
     def flag(self, name: str, default: bool) -> bool:
+        """True or false."""
         value = self._props.get(name, default)
         if not isinstance(value, bool):
             raise TypeError(f'{self.owner}: "{name}" must be true or false, not {value!r}')
         return value
 
     def choice(self, name: str, default: str, choices: tuple[str, ...]) -> str:
+        """One of a few words."""
         value = self._props.get(name, default)
         if value not in choices:
             allowed = " or ".join(f'"{choice}"' for choice in choices)
@@ -57,6 +62,7 @@ class Parameters:
         return value
 
     def text(self, name: str, default: str = "") -> str:
+        """Any string."""
         value = self._props.get(name, default)
         if not isinstance(value, str):
             raise TypeError(f'{self.owner}: "{name}" must be a string, not {value!r}')

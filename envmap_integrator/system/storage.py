@@ -121,9 +121,11 @@ class Stored:
         return image
 
     def text(self, name: str) -> str:
+        """A string."""
         return self._value(name, "a string", lambda value: isinstance(value, str))
 
     def texts(self, name: str) -> list[str]:
+        """A list of strings."""
         return self._value(
             name,
             "a list of strings",
@@ -131,9 +133,11 @@ class Stored:
         )
 
     def flag(self, name: str) -> bool:
+        """True or false."""
         return self._value(name, "true or false", lambda value: isinstance(value, bool))
 
     def integer(self, name: str, low: int, high: int = 2**31 - 1) -> int:
+        """An integer of ``low`` to ``high``."""
         return self._value(
             name,
             f"an integer of {low} to {high}",
@@ -145,6 +149,7 @@ class Stored:
         return self._value(name, "a number of at least 0", lambda v: _is_finite(v) and v >= 0)
 
     def point(self, name: str) -> list[float]:
+        """Three numbers."""
         return self._value(
             name,
             "three numbers",
