@@ -63,6 +63,11 @@ def test_the_least_limit_counts(system, files, expected):
     assert free_memory() == pytest.approx(expected, abs=1024)
 
 
+def test_a_system_that_says_nothing_has_a_limit_or_none(system):
+    system()
+    assert free_memory() > GB
+
+
 def test_this_machine_has_some():
     assert 0.1 * GB < free_memory() < math.inf
 
