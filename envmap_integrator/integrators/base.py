@@ -80,7 +80,9 @@ class CachedIntegrator(mi.SamplingIntegrator):
         """How paths go; ``seed`` is that of a pass over the picture."""
         raise NotImplementedError
 
-    def maps_for(self, scene: mi.Scene, baked: BakedState, spp: int) -> FarField | None:
+    def maps_for(
+        self, scene: mi.Scene, now: SceneState, baked: BakedState, spp: int
+    ) -> FarField | None:
         """The maps, if there are any; ``spp`` samples share a pixel."""
         return None
 
@@ -224,7 +226,8 @@ class CachedIntegrator(mi.SamplingIntegrator):
         return picture
 
     def _lookup(self, scene, baked: BakedState, spp: int) -> Lookup:
-        return self._scenes(scene).lookup(baked, self.maps_for(scene, baked, spp))
+        now = self._scenes(scene)
+        return now.lookup(baked, self.maps_for(scene, now, baked, spp))
 
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0) -> None:
         """Raises ``NotImplementedError``."""

@@ -10,6 +10,7 @@ from ..emitters.mipmap_cube import MipmapCube
 from ..lookup.cube_map import MAX_RESOLUTION
 from ..lookup.far_field import FarField
 from ..preparation.baked_state import BakedState, Settings
+from ..preparation.scene_state import SceneState
 from ..system.parameters import Parameters
 from ..transport.rules import PathRules
 from .base import GatheringIntegrator
@@ -173,8 +174,10 @@ class EnvmapHybrid(GatheringIntegrator):
             shadow_rays=self.second_hit == "shadow_rays",
         )
 
-    def maps_for(self, scene: mi.Scene, baked: BakedState, spp: int) -> FarField | None:
-        return self._scenes(scene).maps(
+    def maps_for(
+        self, scene: mi.Scene, now: SceneState, baked: BakedState, spp: int
+    ) -> FarField | None:
+        return now.maps(
             scene,
             baked,
             spp * self.secondary_samples,

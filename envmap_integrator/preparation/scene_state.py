@@ -44,6 +44,8 @@ class SceneState:
         map_mirrors: bool,
     ) -> FarField | None:
         """Its maps where kernels read them, uploaded once: see ``far_field``."""
+        if not baked.maps:
+            return None
         settings = n_samples, mip_bias, corrected, map_mirrors
         if self._maps is None or self._maps[0] is not baked or self._maps[1] != settings:
             found = far_field(scene, baked.maps, baked.cluster_of_cell, *settings)

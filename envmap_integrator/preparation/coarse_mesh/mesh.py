@@ -29,6 +29,11 @@ class CoarseMesh:
     cell_of_point: np.ndarray
     space_of_point: np.ndarray
 
+    def parts(self) -> mi.UInt32:
+        """Which of its ``PARTS`` of a patch each point [N] lies in."""
+        place = self.points.places()
+        return self.patches.part(place[0], self.patches.locate(*place).patch_size)
+
     def without(self, dropped: np.ndarray) -> CoarseMesh:
         """The mesh without some patches [P]: paths that come there are traced on."""
         kept = (self.patch_of_point >= 0) & ~dropped[self.patch_of_point]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -37,6 +38,7 @@ class PatchPoints:
         self.patches = np.flatnonzero(np.diff(by_patch.indptr))
         self.first = np.append(by_patch.indptr[self.patches], len(standing)).astype(np.uint32)
         self.points = points
+        self._mesh = mesh
         self.n_cells = dr.width(mesh.patches.levels)
         key = self._parts(points.position[by_patch.data])
         order = np.argsort(key, kind="stable")
@@ -47,6 +49,20 @@ class PatchPoints:
         self._first_part = upload(mi.UInt32, first_part)
         self._first_of_part = upload(mi.UInt32, np.append(first_of_part, len(key)))
         self._index = upload(mi.UInt32, self.index)
+
+    @cached_property
+    def parts(self) -> mi.UInt32:
+        """Which of the ``PARTS`` of its patch each surface point [N] lies in."""
+        parts = self._mesh.parts()
+        dr.eval(parts)
+        return parts
+
+    @cached_property
+    def rank_of_patch(self) -> np.ndarray:
+        """Place [P + 1] of each patch in ``patches``, K of others; the last stands for none."""
+        rank = np.full(self._mesh.patches.count + 1, len(self.patches))
+        rank[self.patches] = np.arange(len(self.patches))
+        return rank
 
     def _parts(self, position: np.ndarray) -> np.ndarray:
         """Number of the part of a patch in which each point lies, ascending from patch to patch."""
@@ -91,9 +107,7 @@ def only_standing(mesh: CoarseMesh) -> CoarseMesh:
     points, patches, patch_of_point = mesh.points, mesh.patches, mesh.patch_of_point
     if len(points) == 0:  # Nothing but mirrors and glass.
         return mesh
-    place = points.places()
-    size = patches.locate(*place).patch_size
-    part = PARTS * patch_of_point + patches.part(place[0], size).numpy()
+    part = PARTS * patch_of_point + mesh.parts().numpy()
     has_patch, seen = patch_of_point >= 0, points.seen > 0
     visited = np.zeros(PARTS * patches.count, dtype=bool)
     visited[part[has_patch & seen]] = True

@@ -74,7 +74,7 @@ def coarseness(
     # ---- What the picture reads there, by the rays that end there ----
     largest = max(table.max(), found.max(), 1e-30)
     share = importance / (blocks.count * rays.samples)
-    ends = _Ends(rays, members.patches, len(table) // 2, count > 0)
+    ends = _Ends(rays, members, count > 0)
     weight = ends.weight(share[blocks.rank])
     excess = weight * (
         dr.gather(mi.Float, upload(mi.Float, table), rays.row)
@@ -117,10 +117,8 @@ class _Ends:
     read_rank  [N * B]  of the patch that is read there
     """
 
-    def __init__(self, rays: GatherRays, patches: np.ndarray, n_patches: int, known: np.ndarray):
-        rank_of_patch = np.full(n_patches + 1, len(patches))
-        rank_of_patch[patches] = np.arange(len(patches))
-        rank_of_patch = upload(mi.UInt32, rank_of_patch)
+    def __init__(self, rays: GatherRays, members: PatchPoints, known: np.ndarray):
+        rank_of_patch = upload(mi.UInt32, members.rank_of_patch)
         known = np.vstack([known, np.zeros((1, PARTS), dtype=bool)])
         self._rays = rays
         self.rank = dr.gather(mi.UInt32, rank_of_patch, rays.place // PARTS)

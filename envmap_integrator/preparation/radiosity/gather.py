@@ -113,17 +113,13 @@ def gather(
     Rays start from random ones of the points, with as many shadow rays. ``samples`` must be a power
     of two.
     """
-    position, normal, object_id = members.points.places()
-    cell = lookup.patches.locate(position, normal, object_id)
-    parts = lookup.patches.part(position, cell.patch_size)
-    dr.eval(parts)
     launch = max(MAX_LANES // samples, 1)
     found = []
     with stage("Gathering irradiance", total=len(rank)) as advance:
         for begin in range(0, len(rank), launch):
             some = rank[begin : begin + launch]
             seed_ = seed + 1 + begin
-            found.append(_gather(scene, lookup, members, parts, some, samples, seed_))
+            found.append(_gather(scene, lookup, members, some, samples, seed_))
             advance(len(some))
     return GatherRays.concatenate(found)
 
@@ -135,7 +131,7 @@ def block_mean(value: mi.Spectrum | mi.Float, samples: int) -> mi.Spectrum | mi.
     return type(value)(*(dr.block_sum(c, samples) / samples for c in value))
 
 
-def _gather(scene, lookup, members, parts, rank, samples, seed) -> GatherRays:
+def _gather(scene, lookup, members, rank, samples, seed) -> GatherRays:
     n_lanes = len(rank) * samples
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, n_lanes)
@@ -146,7 +142,7 @@ def _gather(scene, lookup, members, parts, rank, samples, seed) -> GatherRays:
     point = members.sample(member, sampler.next_1d())
     si = members.points.interaction(point)
     patch = dr.gather(mi.UInt32, upload(mi.UInt32, members.patches), member)
-    start_place = PARTS * patch + dr.gather(mi.UInt32, parts, point)
+    start_place = PARTS * patch + dr.gather(mi.UInt32, members.parts, point)
 
     # ---- Low-discrepancy numbers, rotated at random for each block (Cranley-Patterson) ----
     u = _rotated(

@@ -89,7 +89,7 @@ def cache_noise(
     table = cache.mean_channel()
     irradiance = table[2 * members.patches]
     views = _views(members, irradiance)
-    total, indirect = _importance(rays, blocks, cache, members, views)
+    total, indirect = _importance(rays, blocks, members, views)
     of_patches = mean_channel(rays.weight * cache.irradiance(rays.row))
     dr.eval(of_patches)
     # What is seen first gathers by rays of its own, as if it were patches.
@@ -162,7 +162,7 @@ def _views(members: PatchPoints, irradiance: np.ndarray) -> np.ndarray:
     return np.column_stack(views) if views else np.zeros((n_patches, 1))
 
 
-def _importance(rays, blocks, cache, members, views) -> tuple[np.ndarray, np.ndarray]:
+def _importance(rays, blocks, members, views) -> tuple[np.ndarray, np.ndarray]:
     """By how much each picture changes with a patch's direct and indirect irradiance [K, S].
 
     A picture sends secondary rays of its own from what it sees first; they end where the gather
@@ -173,12 +173,10 @@ def _importance(rays, blocks, cache, members, views) -> tuple[np.ndarray, np.nda
     weight, row = (
         x.numpy().reshape(-1, samples)[:, some] for x in (mean_channel(rays.weight), rays.row)
     )
-    rank_of_patch = np.full(cache.patches.count, n_patches)
-    rank_of_patch[members.patches] = np.arange(n_patches)
     rank = blocks.rank[:, None]
     weight = weight / (weight.shape[1] * blocks.count[rank])
     place = (
-        (2 * rank_of_patch[row >> 1] + (row & 1)).ravel(),
+        (2 * members.rank_of_patch[row >> 1] + (row & 1)).ravel(),
         np.broadcast_to(rank, row.shape).ravel(),
     )
     flow = csr_matrix((weight.ravel(), place), (2 * n_patches + 2, n_patches))
