@@ -12,7 +12,7 @@ from ..system.jit import opaque_point
 from ..system.ray_counts import Ray, count
 from .direct_light import WideShare, sample_emitter, sample_emitters
 from .gathered import Gathered
-from .lobes import Scattered, is_delta, is_diffuse, single_lobe
+from .lobes import Scattered, is_delta, is_diffuse, is_direction, single_lobe
 from .path import follow, survival_probability
 from .rules import PathRules
 from .state import PathStart, camera_path
@@ -166,7 +166,7 @@ def follow_mirrors(
             mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active
         )
         solid |= active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
-        throughput[active] *= weight
+        throughput[active] *= dr.select(is_direction(si, bs.wo), weight, 0)
         eta[active] *= bs.eta
         bounces += 1
         survival = survival_probability(throughput, eta, bounces)

@@ -55,6 +55,15 @@ def is_wide(si: mi.SurfaceInteraction3f, wo: mi.Vector3f, pdf: mi.Float) -> mi.B
     return (pdf <= NARROW_PDF) & (mi.Frame3f.cos_theta(si.wi) * mi.Frame3f.cos_theta(wo) > 0)
 
 
+def is_direction(si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> mi.Bool:
+    """Does a ray to ``wo`` (in the local frame) go anywhere?
+
+    Broken meshes have shading normals that are no numbers. Rays along such hit nothing, as if they
+    had left the scene: the sky would shine into closed rooms.
+    """
+    return dr.squared_norm(si.to_world(wo)) > 0
+
+
 @dataclass
 class Scattered:
     """Where a path goes on from a surface.
@@ -73,6 +82,7 @@ class Scattered:
     @staticmethod
     def of(si: mi.SurfaceInteraction3f, bs: mi.BSDFSample3f, weight: mi.Spectrum) -> Scattered:
         """A direction that a material has sampled."""
+        weight = dr.select(is_direction(si, bs.wo), weight, 0)
         specular = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         return Scattered(bs, weight, specular, is_wide(si, bs.wo, bs.pdf) & ~specular)
 
@@ -100,6 +110,7 @@ def choose_lobes(
     while dr.hint(active, exclude=[bsdf, si, residual], label="Choose lobes"):
         lobe = (mi.Float(i) + u) / count
         one, one_weight = bsdf.sample(mi.BSDFContext(), si, lobe, sampler.next_2d(), active)
+        one_weight = dr.select(is_direction(si, one.wo), one_weight, 0)
         delta = mi.has_flag(one.sampled_type, mi.BSDFFlags.Delta)
         one_wide = is_wide(si, one.wo, one.pdf) & ~delta
         cached += dr.select(one_wide, one_weight, 0)

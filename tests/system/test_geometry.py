@@ -18,10 +18,27 @@ from tests.helpers import (
     measure,
     picture,
 )
+from tests.unit.kit import mesh
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 SKY = {"type": "constant", "radiance": 1.0}
+
+# ---------------------- Broken meshes ----------------------
+
+
+@pytest.mark.parametrize("name", INTEGRATORS)
+@pytest.mark.parametrize("material", ["dielectric", "thindielectric", "plastic", "conductor"])
+def test_no_sky_shines_into_closed_rooms(tmp_path, name, material):
+    """From shading normals that are no numbers: rays along them hit nothing."""
+    corners = [[x, y, z] for x in (-0.4, 0.4) for y in (-0.4, 0.4) for z in (-1.9, -1.1)]
+    tetrahedron = [[0, 3, 5], [0, 6, 3], [0, 5, 6], [3, 6, 5]]
+    mesh(corners, tetrahedron, np.zeros((8, 3))).write_ply(str(tmp_path / "broken.ply"))
+    broken = {"type": "ply", "filename": str(tmp_path / "broken.ply"), "bsdf": {"type": material}}
+    scene = load(room(lamp=None, block=None, ball=broken, sky=SKY))
+    found = np.array(mi.render(scene, integrator=integrator(name), spp=64))
+    assert not (found > 0).any()
+
 
 # ---------------------- Scale and place ----------------------
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import mitsuba as mi
@@ -111,16 +112,8 @@ def test_a_cube_that_holds_the_whole_scene_is_no_cluster():
 @pytest.mark.parametrize(("scale", "shift"), [(1e-4, 0.0), (1e5, 0.0), (1.0, 1e4)])
 def test_clusters_depend_neither_on_scale_nor_on_place(scale, shift):
     points = hall()
-    moved = SurfacePoints(
-        (points.position.astype(np.float64) * scale + shift).astype(np.float32),
-        points.normal,
-        points.shading_normal,
-        points.object_id,
-        points.seen,
-        points.turned,
-        points.bounce,
-        points.reflects,
-    )
+    place = (points.position.astype(np.float64) * scale + shift).astype(np.float32)
+    moved = replace(points, position=place)
     here, there = found(points)[0], found(moved)[0]
     assert len(here) == len(there)
     radii = sorted(cluster.radius * scale for cluster in here)

@@ -20,15 +20,17 @@ WALL = 0.1
 """Where a wall divides the room: at no border of a patch."""
 
 
-def rooms(*places: float, gap: float = 0.0, contents=()):
-    """The mesh of a room 4 wide, a wall with a gap at one end in it, sensors at the given x."""
+def rooms(*places: float, gap: float = 0.0, contents=(), **others):
+    """The mesh of a room 4 wide, a wall with a gap at one end in it, sensors at the given x, and
+    others.
+    """
     wall = at(WALL, 2 * gap, 0).rotate([0, 1, 0], 90).scale([2.1, 2.1, 1])
     shapes = [box(2.0), {"type": "rectangle", "to_world": wall}, *contents]
     sensors = {
         f"sensor{i}": camera(origin=(x, -1.8, 0.4), target=(x, 0.5, -1))
         for i, x in enumerate(places)
     }
-    scene = scene_of(*(shape | {"bsdf": PAINT} for shape in shapes), **sensors)
+    scene = scene_of(*(shape | {"bsdf": PAINT} for shape in shapes), **sensors, **others)
     return find_spaces(scene, only_standing(coarse_mesh(scene, BUDGET)))
 
 
@@ -53,6 +55,16 @@ def test_rooms_that_sensors_are_in_are_spaces():
     coarse = rooms(-1, 1)
     here, there = (spaces_at(coarse, side) - {-1} for side in (left, right))
     assert len(here) == len(there) == 1 and here != there
+
+
+@pytest.mark.parametrize("gap", [0.0, 0.3])
+def test_a_wall_may_cut_through_the_film(gap):
+    """Of a sensor with parallel rays; where both sides see each other, all is one space."""
+    sensor = camera() | {"type": "orthographic"}
+    parallel = {k: v for k, v in sensor.items() if k not in ("fov", "near_clip")}
+    coarse = rooms(gap=gap, parallel=parallel)
+    here, there = (spaces_at(coarse, side) - {-1} for side in (left, right))
+    assert len(here) == len(there) == 1 and (here == there) == (gap > 0)
 
 
 @pytest.mark.parametrize("places", [(-1.0, -1.2), (-1.0, 1.0)])

@@ -34,15 +34,19 @@ LOOKS = 16
 def find_spaces(scene: mi.Scene, mesh: CoarseMesh, seed: int = 0) -> CoarseMesh:
     """The mesh with the space of every surface point.
 
-    A walk stays in the space of its sensor. Sensors are in the same one if their walks see each
-    other. Other points are in that of a walk that they see, which is tested only for those that
-    stand for patches. Without sensors, all is one space.
+    A walk stays in the space where it starts, which is the same for all walks of a sensor that
+    start in sight of one place. Other walks are in the same one if they see each other. Other
+    points are in that of a walk that they see, which is tested only for those that stand for
+    patches. Without sensors, all is one space.
     """
     points = mesh.points
-    walk = points.seen.astype(np.int64)
-    walked = np.flatnonzero(walk)
+    walked = np.flatnonzero(points.seen)
     if len(walked) == 0:
         return mesh
+    walk = points.seen.astype(np.int64)
+    if points.start.any():
+        starts = walk[walked] * (points.start.max() + 1) + points.start[walked]
+        walk[walked] = 1 + np.unique(starts, return_inverse=True)[1]
     space = np.where(walk > 0, 0, -1)
     sight = _Sight(scene, points)
     if walk.max() > 1:

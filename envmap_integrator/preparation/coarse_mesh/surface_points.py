@@ -6,7 +6,7 @@ curves. The cost doesn't depend on the number of triangles.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import drjit as dr
@@ -28,6 +28,8 @@ LOBES = 8
 UNTURNED = 1 - 1e-5
 #: Points from which the extent of all is told.
 EXTENT_POINTS = 1 << 14
+#: Spaces that the rays of one sensor may start in; what is left is taken for one more.
+MOST_STARTS = 8
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,7 @@ class SurfacePoints:
     bounce          [N]     which hit of its walk or line it is, from 0
     reflects        [N]     weight with which its walk has gone on, mean of the colour channels; 0
                             on a line
+    start           [N]     walks of one sensor with the same number start in sight of one place
     """
 
     position: np.ndarray
@@ -53,6 +56,7 @@ class SurfacePoints:
     turned: np.ndarray
     bounce: np.ndarray
     reflects: np.ndarray
+    start: np.ndarray
 
     def __len__(self) -> int:
         return len(self.position)
@@ -169,7 +173,10 @@ def scatter_points(
         points = []
         for index, sensor in enumerate(sensors):
             sampler.seed(1009 * (MAX_BATCHES * seed + batch) + index + 1, n_rays)
-            points.append(_walk(scene, object_ids, sampler, sensor, n_rays, wanted, index + 1))
+            walk = _walk(scene, object_ids, sampler, sensor, n_rays, wanted, index + 1)
+            # Only those that start where the sensor's middle is known to be are alike in batches.
+            start = np.where(walk.start > 0, walk.start + (MOST_STARTS + 1) * batch, 0)
+            points.append(replace(walk, start=start))
         return points
 
     points = []
@@ -197,7 +204,33 @@ def walk_from(
 
 def _walk(scene, object_ids, sampler, sensor, n_rays, wanted, number) -> SurfacePoints:
     ray = _sensor_rays(sensor, sampler)
-    return _hits_along(scene, object_ids, sampler, ray, wanted, walk=number)
+    start = _starts(scene, sensor, ray.o)
+    return _hits_along(scene, object_ids, sampler, ray, wanted, walk=number, start=start)
+
+
+def _starts(scene: mi.Scene, sensor: mi.Sensor, origin: mi.Point3f) -> np.ndarray | None:
+    """Which rays of a sensor start in the same space: a number for each, None if all do.
+
+    The film of an orthographic camera may lie across a wall. Rays that start in sight of the middle
+    of the film get 0, those in sight of another start the next number.
+    """
+    middle, _ = sensor.sample_ray(0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5))
+    place = mi.Point3f(middle.o)
+    if not dr.any(dr.any(origin != place)):
+        return None
+    dr.eval(origin)
+    start = np.full(dr.width(origin), MOST_STARTS)
+    for number in range(MOST_STARTS):
+        ray = mi.Ray3f(origin, place - origin)
+        ray.maxt = mi.Float(1)
+        count(Ray.SURVEY, ray, True)
+        open_ = (start == MOST_STARTS) & ~scene.ray_test(ray).numpy()
+        start[open_] = number
+        missing = np.flatnonzero(start == MOST_STARTS)
+        if len(missing) == 0:
+            break
+        place = dr.gather(mi.Point3f, origin, mi.UInt32(int(missing[0])))
+    return start
 
 
 def _spheres(scene: mi.Scene, walks: list[SurfacePoints]) -> np.ndarray:
@@ -274,6 +307,7 @@ def _hits_along(
     wanted: mi.BSDFFlags,
     walk: int = 0,
     within: mi.Vector4f | None = None,
+    start: np.ndarray | None = None,
 ) -> SurfacePoints:
     """Follow rays over several hits, on a walk of a sensor or straight through surfaces.
 
@@ -342,4 +376,5 @@ def _hits_along(
         turned.numpy()[chosen],
         (chosen // n_rays).astype(np.uint32),
         reflects.numpy()[chosen],
+        np.zeros(len(chosen), dtype=np.int64) if start is None else start[chosen % n_rays],
     )
