@@ -214,7 +214,7 @@ def _starts(scene: mi.Scene, sensor: mi.Sensor, origin: mi.Point3f) -> np.ndarra
     The film of an orthographic camera may lie across a wall. Rays that start in sight of the middle
     of the film get 0, those in sight of another start the next number.
     """
-    middle, _ = sensor.sample_ray(0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5))
+    middle, _ = sensor.sample_ray_differential(0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5))
     place = mi.Point3f(middle.o)
     if not dr.any(dr.any(origin != place)):
         return None
