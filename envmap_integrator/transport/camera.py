@@ -12,7 +12,7 @@ from ..system.jit import opaque_point
 from ..system.ray_counts import Ray, count
 from .direct_light import WideShare, sample_emitter, sample_emitters
 from .gathered import Gathered
-from .lobes import Scattered, is_delta, is_diffuse, is_direction, single_lobe
+from .lobes import Scattered, is_delta, is_diffuse, single_lobe
 from .path import follow, survival_probability
 from .rules import PathRules
 from .state import PathStart, camera_path
@@ -162,11 +162,11 @@ def follow_mirrors(
     emitted = mi.Spectrum(0)
     while dr.hint(active, label="Follow mirrors"):
         emitted += throughput * si.emitter(scene).eval(si, active)
-        bs, weight = si.bsdf(ray).sample(
-            mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active
-        )
+        u, v = sampler.next_1d(), sampler.next_2d()
+        scattered = Scattered.of(si, *si.bsdf(ray).sample(mi.BSDFContext(), si, u, v, active))
+        bs = scattered.bs
         solid |= active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
-        throughput[active] *= dr.select(is_direction(si, bs.wo), weight, 0)
+        throughput[active] *= scattered.weight
         eta[active] *= bs.eta
         bounces += 1
         survival = survival_probability(throughput, eta, bounces)

@@ -55,15 +55,6 @@ def is_wide(si: mi.SurfaceInteraction3f, wo: mi.Vector3f, pdf: mi.Float) -> mi.B
     return (pdf <= NARROW_PDF) & (mi.Frame3f.cos_theta(si.wi) * mi.Frame3f.cos_theta(wo) > 0)
 
 
-def is_direction(si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> mi.Bool:
-    """Does a ray to ``wo`` (in the local frame) go anywhere?
-
-    Broken meshes have shading normals that are no numbers. Rays along such hit nothing, as if they
-    had left the scene: the sky would shine into closed rooms.
-    """
-    return dr.squared_norm(si.to_world(wo)) > 0
-
-
 @dataclass
 class Scattered:
     """Where a path goes on from a surface.
@@ -81,8 +72,12 @@ class Scattered:
 
     @staticmethod
     def of(si: mi.SurfaceInteraction3f, bs: mi.BSDFSample3f, weight: mi.Spectrum) -> Scattered:
-        """A direction that a material has sampled."""
-        weight = dr.select(is_direction(si, bs.wo), weight, 0)
+        """A direction that a material has sampled.
+
+        Broken meshes have shading normals that are no numbers. Rays along such hit nothing, as if
+        they had left the scene: the sky would shine into closed rooms.
+        """
+        weight = dr.select(dr.squared_norm(si.to_world(bs.wo)) > 0, weight, 0)
         specular = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         return Scattered(bs, weight, specular, is_wide(si, bs.wo, bs.pdf) & ~specular)
 
@@ -109,18 +104,15 @@ def choose_lobes(
     u = sampler.next_1d()
     while dr.hint(active, exclude=[bsdf, si, residual], label="Choose lobes"):
         lobe = (mi.Float(i) + u) / count
-        one, one_weight = bsdf.sample(mi.BSDFContext(), si, lobe, sampler.next_2d(), active)
-        one_weight = dr.select(is_direction(si, one.wo), one_weight, 0)
-        delta = mi.has_flag(one.sampled_type, mi.BSDFFlags.Delta)
-        one_wide = is_wide(si, one.wo, one.pdf) & ~delta
-        cached += dr.select(one_wide, one_weight, 0)
-        chance = dr.select(one_wide, dr.select(residual, mi.Float(1), 0), count - 1)
-        chance = dr.select(dr.max(one_weight) > 0, chance, 0)
+        one = Scattered.of(si, *bsdf.sample(mi.BSDFContext(), si, lobe, sampler.next_2d(), active))
+        cached += dr.select(one.wide, one.weight, 0)
+        chance = dr.select(one.wide, dr.select(residual, mi.Float(1), 0), count - 1)
+        chance = dr.select(dr.max(one.weight) > 0, chance, 0)
         chances += chance
         taken = sampler.next_1d() * chances < chance
-        bs = dr.select(taken, one, bs)
-        wide = dr.select(taken, one_wide, wide)
-        weight = dr.select(taken, one_weight / chance, weight)
+        bs = dr.select(taken, one.bs, bs)
+        wide = dr.select(taken, one.wide, wide)
+        weight = dr.select(taken, one.weight / chance, weight)
         i += 1
         active &= i < count
     specular = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)

@@ -6,7 +6,7 @@ curves. The cost doesn't depend on the number of triangles.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import drjit as dr
@@ -173,10 +173,11 @@ def scatter_points(
         points = []
         for index, sensor in enumerate(sensors):
             sampler.seed(1009 * (MAX_BATCHES * seed + batch) + index + 1, n_rays)
-            walk = _walk(scene, object_ids, sampler, sensor, n_rays, wanted, index + 1)
-            # Only those that start where the sensor's middle is known to be are alike in batches.
-            start = np.where(walk.start > 0, walk.start + (MOST_STARTS + 1) * batch, 0)
-            points.append(replace(walk, start=start))
+            ray = _sensor_rays(sensor, sampler)
+            start = _starts(scene, sensor, ray.o, batch)
+            points.append(
+                _hits_along(scene, object_ids, sampler, ray, wanted, walk=index + 1, start=start)
+            )
         return points
 
     points = []
@@ -199,20 +200,17 @@ def walk_from(
     """What walks from a sensor meet, as ``scatter_points`` does it."""
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, n_rays)
-    return _walk(scene, object_ids, sampler, sensor, n_rays, mi.BSDFFlags.Smooth, 1)
-
-
-def _walk(scene, object_ids, sampler, sensor, n_rays, wanted, number) -> SurfacePoints:
     ray = _sensor_rays(sensor, sampler)
-    start = _starts(scene, sensor, ray.o)
-    return _hits_along(scene, object_ids, sampler, ray, wanted, walk=number, start=start)
+    return _hits_along(scene, object_ids, sampler, ray, mi.BSDFFlags.Smooth, walk=1)
 
 
-def _starts(scene: mi.Scene, sensor: mi.Sensor, origin: mi.Point3f) -> np.ndarray | None:
+def _starts(
+    scene: mi.Scene, sensor: mi.Sensor, origin: mi.Point3f, batch: int
+) -> np.ndarray | None:
     """Which rays of a sensor start in the same space: a number for each, None if all do.
 
     The film of an orthographic camera may lie across a wall. Rays that start in sight of the middle
-    of the film get 0, those in sight of another start the next number.
+    of the film get 0, those in sight of another start the next number, which no other batch uses.
     """
     middle, _ = sensor.sample_ray_differential(0, 0.5, mi.Point2f(0.5), mi.Point2f(0.5))
     place = mi.Point3f(middle.o)
@@ -230,7 +228,7 @@ def _starts(scene: mi.Scene, sensor: mi.Sensor, origin: mi.Point3f) -> np.ndarra
         if len(missing) == 0:
             break
         place = dr.gather(mi.Point3f, origin, mi.UInt32(int(missing[0])))
-    return start
+    return np.where(start > 0, start + (MOST_STARTS + 1) * batch, 0)
 
 
 def _spheres(scene: mi.Scene, walks: list[SurfacePoints]) -> np.ndarray:
