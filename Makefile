@@ -18,7 +18,7 @@ LLVM_PACKAGES := libllvm19 libllvm20 libllvm21 libllvm18 libllvm17 libllvm17t64
 .DELETE_ON_ERROR:
 
 render: $(LLVM)
-	$(BIN)/python -m compare render $(SCENE)
+	$(BIN)/python -m compare render $(SCENE) --equal time --runs 3 --reference-spp 128
 
 test: $(LLVM)
 	$(BIN)/python -m pytest

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import mitsuba as mi
@@ -111,12 +111,17 @@ class Measurements:
 
 
 def interleave(
-    tasks: Sequence[Task], n_runs: int, seed: int, hide_emitters: bool = False
+    tasks: Sequence[Task],
+    n_runs: int,
+    seed: int,
+    hide_emitters: bool = False,
+    each: Callable[[Measurements], None] = lambda measurements: None,
 ) -> list[Measurements]:
     """Let the tasks take turns, ``n_runs`` times: a machine slows all of them or none.
 
     Run ``i`` of every task has the seed ``seed + i``. Each run has a preparation of its own, which
-    counts: what is prepared depends on the samples.
+    counts: what is prepared depends on the samples. After it, ``each`` gets what its task has so
+    far.
     """
     measured = [Measurements(task.subject, task.spp) for task in tasks]
     for task in tasks:
@@ -130,18 +135,25 @@ def interleave(
                     prepare_for_denoiser(integrator)
                 measurements.settings = str(integrator)
                 measurements.runs.append(_timed_run(task, integrator, seed + index))
+                each(measurements)
                 advance(1)
     return measured
 
 
-def equal_time_spp(task: Task, pilot_spp: int, seed: int, hide_emitters: bool = False) -> int:
+def equal_time_spp(
+    task: Task,
+    pilot_spp: int,
+    seed: int,
+    hide_emitters: bool = False,
+    each: Callable[[Measurements], None] = lambda measurements: None,
+) -> int:
     """Samples per pixel of ``path`` that fit into the time of a task, by two pilot runs.
 
     ``pilot_spp`` are those of the pilot of ``path``. Samplers that stratify round up to full grids,
-    so the number is one of a nearly square grid.
+    so the number is one of a nearly square grid. ``each`` is that of ``interleave``.
     """
     pilots = [task, Task(task.scene, PATH, pilot_spp)]
-    ours, path = interleave(pilots, 2, seed, hide_emitters)
+    ours, path = interleave(pilots, 2, seed, hide_emitters, each)
     spp = max(round(pilot_spp * ours.runs[1].total_s / path.runs[1].total_s), 1)
     rows = math.isqrt(spp)
     return rows * round(spp / rows)

@@ -5,10 +5,12 @@ Pictures side by side with a slider, signed errors against a path traced referen
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 
 from compare.figures import panels
@@ -18,6 +20,7 @@ from compare.references import Reference, reference
 from compare.report import Illustration, Report, Slider, Table
 from compare.runs import Measurements, Task, equal_time_spp, interleave
 from compare.scenes import PAPER_ROOM, PATH, Subject, View
+from envmap_integrator.cli.output import write_png
 
 SCENES = (PAPER_ROOM,)
 
@@ -53,12 +56,33 @@ def _compare(view: View, options: Options, folder: Path) -> Report:
     subjects = [Subject.parse(name) for name in named if name != "path"]
     tasks = [Task(scene, subject, options.spp) for subject in subjects]
     spp = options.spp
+    first_look = _FirstLook(view, folder)
     if options.equal == "time" and tasks:
-        spp = equal_time_spp(tasks[0], spp, options.seed, hidden)
+        spp = equal_time_spp(tasks[0], spp, options.seed, hidden, first_look)
     tasks.append(Task(scene, PATH, spp))
-    measured = interleave(tasks, options.runs, options.seed, hidden)
+    measured = interleave(tasks, options.runs, options.seed, hidden, first_look)
     judged_by = reference(view, options.reference_spp, folder / "references")
     return _report(view, options, measured, judged_by)
+
+
+class _FirstLook:
+    """Writes each integrator's first picture and tells where it is: a reference takes a while."""
+
+    def __init__(self, view: View, folder: Path):
+        self._view, self._folder = view, folder
+        self._written: set[tuple[str, int]] = set()
+
+    def __call__(self, measurements: Measurements) -> None:
+        name, spp, run = measurements.subject.name, measurements.spp, measurements.runs[-1]
+        if (name, spp) in self._written:
+            return
+        self._written.add((name, spp))
+        self._folder.mkdir(parents=True, exist_ok=True)
+        plain = re.sub(r"[^\w.-]+", "-", name)
+        path = self._folder / f"{self._view.name}-{plain}.png"
+        write_png(path, mi.Bitmap(run.picture))
+        took = f"in {run.total_s:.1f} s, after {run.compile_s:.1f} s of compilation"
+        print(f"wrote {path}: {spp} samples per pixel {took}", flush=True)
 
 
 def _report(

@@ -8,7 +8,13 @@ from contextlib import contextmanager
 from threading import Timer
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 quiet = False
 """Set to True to show no bars in this process."""
@@ -36,7 +42,8 @@ def stage(name: str, total: float | None = None) -> Iterator[Callable[[float], N
     # Rich allows one live display a process: nested stages are rows of the outermost one.
     outermost = _display is None
     display = _display = _display or Progress(
-        TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(),
+        TextColumn("{task.description}"), BarColumn(),
+        TimeElapsedColumn(), TextColumn("left:"), TimeRemainingColumn(),
         console=console, transient=True,
     )  # fmt: skip
     task = display.add_task(name, total=total, visible=False)

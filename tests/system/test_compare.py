@@ -11,7 +11,7 @@ import pytest
 from compare import report, variants
 from compare.__main__ import EXPERIMENTS, main
 from compare.contributions import Ledger
-from compare.experiments import error_vs_time
+from compare.experiments import error_vs_time, render
 from compare.options import JudgedOptions
 from compare.references import Reference, reference
 from compare.runs import Task, interleave
@@ -264,6 +264,25 @@ def test_compilation_is_apart():
     (measurements,) = interleave([Task(scene, PATH, 3)], 3, seed=0)
     assert measurements.runs[1].compile_s == measurements.runs[2].compile_s == 0
     assert measurements.runs[0].render_s < 20 * measurements.median("render_s")
+
+
+@pytest.mark.parametrize("equal", ["spp", "time"])
+def test_pictures_are_there_before_the_reference(tmp_path, monkeypatch, capsys, equal):
+    """A reference takes longer than all pictures together."""
+    shown = []
+
+    def judged_by(view, spp, folder):
+        shown.append(sorted(path.name for path in tmp_path.glob("*.png")))
+        return reference(view, spp, folder)
+
+    monkeypatch.setattr(render, "reference", judged_by)
+    ours = "envmap_hybrid:patches=256"
+    options = render.Options(**COMMON, spp=4, reference_spp=16, integrators=(ours,), equal=equal)
+    list(render.run(options, tmp_path))
+    names = ["paper_room-envmap_hybrid-patches-256.png", "paper_room-path.png"]
+    assert shown == [names]
+    printed = capsys.readouterr().out
+    assert all(f"wrote {tmp_path / name}: " in printed for name in names)
 
 
 # ---------------------- Command line ----------------------
