@@ -6,6 +6,7 @@ The stock ``mitsuba`` executable can't load plugins written in Python; this one 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import os
 import sys
 from collections.abc import Sequence
@@ -16,6 +17,7 @@ from envmap_integrator.cli import commands
 from envmap_integrator.cli.doctor import doctor
 from envmap_integrator.cli.errors import condense
 from envmap_integrator.cli.scene_file import parse_assignment, parse_setting
+from envmap_integrator.system import progress
 from envmap_integrator.system.interrupt import interruptible
 
 EXIT_BAD_INPUT = 2
@@ -28,7 +30,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     That is 0, 1 (``doctor`` found a fault), 2 (bad input) or 130 (Ctrl-C).
     """
-    args = build_parser().parse_args(arguments)
+    parser = build_parser()
+    if importlib.util.find_spec("argcomplete"):
+        import argcomplete
+
+        argcomplete.autocomplete(parser)
+    args = parser.parse_args(arguments)
+    progress.quiet = getattr(args, "quiet", False) or getattr(args, "json", False)
     try:
         with interruptible(otherwise=_end):
             return args.command(args)
@@ -48,8 +56,32 @@ def _end() -> None:
     os._exit(EXIT_INTERRUPTED)
 
 
+EXIT_CODES = """exit codes:
+  0    done
+  1    doctor: nothing can be rendered with here
+  2    bad input, or a file that can't be read or written: one line on stderr says what to do
+  130  Ctrl-C
+"""
+RENDER_EXAMPLES = """examples:
+  envmap-render render room.xml --spp 16 --denoise --png       # a look
+  envmap-render render room.xml --integrator envmap_hybrid --spp 256 -o room.exr
+  envmap-render render room.xml --set residual_probability=0.5 # without bias, more noise
+  envmap-render render room.xml -D resx=320 -s 1               # smaller, second sensor
+  envmap-render render room.xml --json | jq .seconds
+
+"""
+BAKE_EXAMPLES = """examples:
+  envmap-render bake room.xml --integrator envmap_hybrid -o state.exr
+  envmap-render render room.xml --integrator envmap_hybrid --set cache_file=state.exr
+
+"""
+
+
 class _Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line, without the usage text."""
+    """Says what is wrong in one line, without the usage text, and shows examples as they are."""
+
+    def __init__(self, **settings):
+        super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, **settings)
 
     def error(self, message: str) -> NoReturn:
         self.exit(EXIT_BAD_INPUT, f"{self.prog}: {message} (see --help)\n")
@@ -57,10 +89,15 @@ class _Parser(argparse.ArgumentParser):
 
 def build_parser() -> argparse.ArgumentParser:
     """The command line, one sub-command a function of :mod:`envmap_integrator.cli.commands`."""
-    parser = _Parser(prog="envmap-render", description=__doc__)
+    parser = _Parser(prog="envmap-render", description=__doc__, epilog=EXIT_CODES)
     subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
 
-    render = subparsers.add_parser("render", help="render a scene to an OpenEXR file")
+    render = subparsers.add_parser(
+        "render",
+        help="render a scene to an OpenEXR file",
+        description="Render a scene to an OpenEXR file, by its own integrator or by envmap_hybrid.",
+        epilog=RENDER_EXAMPLES + EXIT_CODES,
+    )
     _add_scene_options(render)
     render.add_argument(
         "-s", "--sensor", type=int, default=0, metavar="INDEX", help="in the scene's order, from 0"
@@ -76,7 +113,12 @@ def build_parser() -> argparse.ArgumentParser:
     )
     render.set_defaults(command=commands.render)
 
-    bake = subparsers.add_parser("bake", help="compute what rendering reuses, and save it")
+    bake = subparsers.add_parser(
+        "bake",
+        help="compute what rendering reuses, and save it",
+        description="Compute what renders of all sensors of a scene reuse, and save it.",
+        epilog=BAKE_EXAMPLES + EXIT_CODES,
+    )
     _add_scene_options(bake)
     bake.add_argument("-o", "--output", type=Path, required=True)
     bake.set_defaults(command=commands.bake)
@@ -104,4 +146,11 @@ def _add_scene_options(parser: argparse.ArgumentParser) -> None:
         "--set", type=parse_setting, action="append", default=[], metavar="KEY=VALUE",
         help="integrator parameter: true, false, an integer, a float (1.0) or a string",
     )  # fmt: skip
+    output = parser.add_mutually_exclusive_group()
+    output.add_argument(
+        "--quiet", action="store_true", help="no table, no progress; warnings and errors remain"
+    )
+    output.add_argument(
+        "--json", action="store_true", help="what there is to know of the result as JSON instead"
+    )
     parser.add_argument("--debug", action="store_true", help="show tracebacks")

@@ -61,7 +61,8 @@ def render(args: argparse.Namespace) -> int:
     write_bitmap(output, bitmap)
     if args.png:
         write_png(output.with_suffix(".png"), bitmap)
-    _report(seconds, compilation, output)
+    error = {"cache_error": state.relative_error} if state else {}
+    _report(args, seconds, compilation, output, **error, settings=settings)
     return 0
 
 
@@ -94,7 +95,7 @@ def bake(args: argparse.Namespace) -> int:
         seconds |= state.stage_times
         compilation = compilation_time()
     state.save(args.output)
-    _report(seconds, compilation, args.output)
+    _report(args, seconds, compilation, args.output)
     return 0
 
 
@@ -163,7 +164,16 @@ def _require(condition: bool, message: str) -> None:
         raise ValueError(message)
 
 
-def _report(seconds: dict[str, float], compilation: float, output: Path) -> None:
+def _report(
+    args: argparse.Namespace, seconds: dict[str, float], compilation: float, output: Path, **more
+) -> None:
+    """Say what has been done, as a table or, with ``more`` of it, as JSON."""
+    if args.quiet:
+        return
+    if args.json:
+        result = {"output": str(output), "seconds": seconds, "compilation_s": compilation} | more
+        print(json.dumps(result))
+        return
     table = Table("stage", "seconds", box=None)
     table.columns[1].justify = "right"
     for stage, duration in seconds.items():

@@ -1,6 +1,8 @@
 """``envmap-render`` from its arguments to its files, messages and exit codes."""
 
 import json
+import os
+import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -80,6 +82,59 @@ def test_render_writes_picture_and_header(scene, capsys):
     assert pixels(scene.with_suffix(".png")).dtype == np.uint8
     assert sorted(path.suffix for path in scene.parent.iterdir()) == [".exr", ".png", ".xml"]
     assert "render" in capsys.readouterr().out
+
+
+def test_quiet(scene, capfd):
+    assert run("render", scene, "--quiet") == 0
+    assert capfd.readouterr() == ("", "")
+    assert scene.with_suffix(".exr").exists()
+
+
+def test_json(tmp_path, capfd):
+    """One object on stdout, and nothing else."""
+    scene = write_scene(tmp_path, "")
+    options = ("--set", "patches=256", "--spp", 4)
+    assert run("render", scene, "--json", *options) == 0
+    result = json.loads(capfd.readouterr().out)
+    assert result["output"] == str(scene.with_suffix(".exr"))
+    assert {"load", "coarse mesh", "render"} <= result["seconds"].keys()
+    assert result["compilation_s"] >= 0
+    assert 0 <= result["cache_error"] < 1
+    assert result["settings"]["integrator"] == "envmap_hybrid"
+    assert run("bake", scene, "--json", "-o", tmp_path / "state.exr") == 0
+    assert json.loads(capfd.readouterr().out)["output"] == str(tmp_path / "state.exr")
+
+
+def test_quiet_or_json(scene, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        run("render", scene, "--quiet", "--json")
+    assert "not allowed with" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", [(), ("render",), ("bake",)])
+def test_help_teaches(capsys, command):
+    with pytest.raises(SystemExit, match="0"):
+        run(*command, "--help")
+    shown = capsys.readouterr().out
+    assert "exit codes:\n  0    done\n" in shown
+    assert not command or f"examples:\n  envmap-render {command[0]} room.xml" in shown
+
+
+def test_shells_can_complete(tmp_path):
+    """As bash asks: what could follow ``envmap-render render --de``?"""
+    line = "envmap-render render --de"
+    answer = tmp_path / "answer"
+    environment = os.environ | {
+        "_ARGCOMPLETE": "1",
+        "_ARGCOMPLETE_STDOUT_FILENAME": str(answer),
+        "_ARGCOMPLETE_IFS": "\n",
+        "COMP_LINE": line,
+        "COMP_POINT": str(len(line)),
+    }
+    code = "from envmap_integrator.cli import main; main()"
+    subprocess.run([sys.executable, "-c", code], env=environment, check=True)
+    words = sorted(word.strip() for word in answer.read_text().split("\n"))
+    assert words == ["--debug", "--define", "--denoise"]
 
 
 def test_integrator_of_the_scene_need_not_exist(tmp_path):
