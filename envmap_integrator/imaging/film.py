@@ -154,11 +154,13 @@ def _lane_per_pixel(values, n_pixels, spp, seed, n_channels):
 
 @dr.syntax
 def _sums(values, points, pixel, end, sums):
-    going = points.index < end
-    while dr.hint(going, label="Samples of a pixel"):
-        sums = [*map(add, sums, values(points, pixel, points.index))]
-        points.advance()
-        going &= (points.index < end) & not_interrupted(points.index)
+    index = mi.UInt32(points.index)
+    going = index < end
+    # What never changes is no state of the loop: Dr.Jit would find out, and record all anew.
+    while dr.hint(going, exclude=[values, points, pixel, end], label="Samples of a pixel"):
+        sums = [*map(add, sums, values(points.of_sample(index), pixel, index))]
+        index += 1
+        going &= (index < end) & not_interrupted(index)
     return sums
 
 

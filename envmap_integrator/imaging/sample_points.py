@@ -12,7 +12,7 @@ of them, so that the errors of neighbours have nothing in common.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -57,10 +57,9 @@ class SamplePoints:
             dimension=mi.UInt32(0),
         )
 
-    def advance(self) -> None:
-        """Go on to the next sample."""
-        self.index = self.index + 1
-        self.dimension = mi.UInt32(0)
+    def of_sample(self, index: mi.UInt32) -> SamplePoints:
+        """Those of another sample, from its first dimension on."""
+        return replace(self, index=mi.UInt32(index), dimension=mi.UInt32(0))
 
     def next_1d(self, active: mi.Bool | bool = True) -> mi.Float:
         """A number in [0, 1)."""

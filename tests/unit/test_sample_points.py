@@ -120,12 +120,12 @@ def test_seeds_give_other_points():
     np.testing.assert_array_equal(points[0], draw(4, lanes=64, seed=2**32))
 
 
-def test_advance():
+def test_points_of_another_sample():
     """One after the other, points are those of a later start."""
     lane = dr.arange(mi.UInt32, 32)
     points = SamplePoints.of(0, lane, 8, mi.UInt32(2))
     points.next_1d()
     points.next_2d()
-    points.advance()
+    points = points.of_sample(mi.UInt32(3))
     later = SamplePoints.of(0, lane, 8, mi.UInt32(3))
     np.testing.assert_array_equal(points.next_2d().numpy(), later.next_2d().numpy())
