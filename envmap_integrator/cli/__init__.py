@@ -65,6 +65,8 @@ EXIT_CODES = """exit codes:
 RENDER_EXAMPLES = """examples:
   envmap-render render room.xml --spp 16 --denoise --png       # a look
   envmap-render render room.xml --integrator envmap_hybrid --spp 256 -o room.exr
+  envmap-render render room.xml --progressive --time 30 --png  # better and better
+  envmap-render render room.xml --target-error 1e-3
   envmap-render render room.xml --set residual_probability=0.5 # without bias, more noise
   envmap-render render room.xml -D resx=320 -s 1               # smaller, second sensor
   envmap-render render room.xml --json | jq .seconds
@@ -110,6 +112,13 @@ def build_parser() -> argparse.ArgumentParser:
     render.add_argument("--png", action="store_true", help="also write an sRGB PNG beside the EXR")
     render.add_argument(
         "--denoise", action="store_true", help="by Open Image Denoise; films get a box filter"
+    )
+    render.add_argument(
+        "--progressive", action="store_true", help="write better pictures while it goes on"
+    )
+    render.add_argument("--time", type=float, metavar="SECONDS", help="end after so long")
+    render.add_argument(
+        "--target-error", type=float, metavar="RELMSE", help="end when so little noise is left"
     )
     render.set_defaults(command=commands.render)
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
+import time
 from pathlib import Path
 
 import drjit as dr
@@ -17,6 +19,7 @@ from envmap_integrator.cli.output import write_bitmap, write_png
 from envmap_integrator.cli.scene_file import SceneFile
 from envmap_integrator.cli.timing import compilation_time, measure, record_kernels
 from envmap_integrator.imaging.denoiser import denoise, prepare_for_denoiser, warm_up
+from envmap_integrator.imaging.progressive import Improving
 from envmap_integrator.system.atomic import check_writable
 from envmap_integrator.system.llvm import ensure_llvm
 
@@ -32,38 +35,113 @@ def render(args: argparse.Namespace) -> int:
         scene_file, scene = _load(args, seconds)
         sensor = _sensor(scene, args.sensor)
         settings = _settings(args, scene_file, scene, sensor)
-        integrator = scene.integrator()
-        for_denoiser = args.denoise and prepare_for_denoiser(integrator)
-        if args.denoise:  # Fails before the work starts, if there is no denoiser.
-            warm_up(*sensor.film().crop_size())
-        state = None
-        if hasattr(integrator, "prepare"):
-            state = integrator.prepare(scene, sensor, args.spp)
-            seconds |= state.stage_times
-        with measure(seconds, "render"):
-            # Not mi.render, which would make another exception of Ctrl-C.
-            dr.eval(integrator.render(scene, sensor, seed=args.seed, spp=args.spp))
-        bitmap = sensor.film().bitmap()
-        if args.denoise:
-            with measure(seconds, "denoise"):
-                _denoise(bitmap, scene, settings)
-        if for_denoiser:
-            _, bitmap = bitmap.split()[0]
+        more: dict[str, float] = {}
+        if _improves(args):
+            bitmap = _improve(args, scene, sensor, settings, seconds, more, output)
+        else:
+            bitmap = _render_at_once(args, scene, sensor, settings, seconds, more)
         compilation = compilation_time()
+    _write(args, output, bitmap, settings, seconds, compilation, more)
+    _report(args, seconds, compilation, output, **more, settings=settings)
+    return 0
 
+
+def _improves(args: argparse.Namespace) -> bool:
+    """Are pictures asked for that get better?"""
+    return args.progressive or args.time is not None or args.target_error is not None
+
+
+def _render_at_once(args, scene, sensor, settings, seconds, more) -> mi.Bitmap:
+    integrator = scene.integrator()
+    for_denoiser = args.denoise and prepare_for_denoiser(integrator)
+    if args.denoise:  # Fails before the work starts, if there is no denoiser.
+        warm_up(*sensor.film().crop_size())
+    if hasattr(integrator, "prepare"):
+        state = integrator.prepare(scene, sensor, args.spp)
+        seconds |= state.stage_times
+        more["cache_error"] = state.relative_error
+    with measure(seconds, "render"):
+        # Not mi.render, which would make another exception of Ctrl-C.
+        dr.eval(integrator.render(scene, sensor, seed=args.seed, spp=args.spp))
+    bitmap = sensor.film().bitmap()
+    if args.denoise:
+        with measure(seconds, "denoise"):
+            _denoise(bitmap, scene, settings)
+    if for_denoiser:
+        _, bitmap = bitmap.split()[0]
+    return bitmap
+
+
+#: Samples per pixel of a pass, and at most if only time or error end it.
+PASS, MOST = 16, 4096
+
+
+def _improve(args, scene, sensor, settings, seconds, more, output) -> mi.Bitmap:
+    """Write pictures that get better, until the samples, the time or the error asked for."""
+    integrator = scene.integrator()
+    _require(
+        hasattr(integrator, "progressive"),
+        f'integrator "{settings["integrator"]}" can\'t go on where it ended: pass --integrator '
+        "envmap_hybrid, or leave out --progressive, --time and --target-error",
+    )
+    _require(not args.denoise, "--denoise takes one picture: leave out --progressive and the like")
+    for flag, value in (("--time", args.time), ("--target-error", args.target_error)):
+        _require(value is None or value > 0, f"{flag} must be above 0, got {value}")
+    asked = args.time is not None or args.target_error is not None
+    total = args.spp or (MOST if asked else settings["spp"])
+    begin = time.perf_counter()
+    pictures = integrator.progressive(
+        scene,
+        sensor,
+        args.seed,
+        min(PASS, total),
+        total,
+        seconds=args.time or math.inf,
+        target_error=args.target_error or 0.0,
+    )
+    state = integrator.prepare(scene, sensor, total)
+    seconds |= state.stage_times
+    more["cache_error"] = state.relative_error
+    prepared = sum(state.stage_times.values())
+    for better in pictures:
+        elapsed = time.perf_counter() - begin
+        seconds["render"] = elapsed - prepared
+        settings["spp"] = better.spp
+        if math.isfinite(better.error):
+            more["noise_error"] = better.error
+        bitmap = sensor.film().bitmap()
+        if args.progressive:
+            _write(args, output, bitmap, settings, seconds, 0.0, more)
+        if not (args.quiet or args.json):
+            print(_progress(better, elapsed, args, total), flush=True)
+    return bitmap
+
+
+def _progress(better: Improving, elapsed: float, args: argparse.Namespace, total: int) -> str:
+    """What there is so far, and how long it may take."""
+    left = [elapsed * (total / better.spp - 1)]
+    if args.time:
+        left.append(args.time - elapsed)
+    if args.target_error and math.isfinite(better.error):
+        left.append(elapsed * (better.error / args.target_error - 1))
+    noise = f"noise {better.error:.1e}" if math.isfinite(better.error) else "noise unknown"
+    return (
+        f"{better.spp} samples per pixel, {noise}, {elapsed:.1f} s; "
+        f"about {max(min(left), 0):.0f} s left"
+    )
+
+
+def _write(args, output, bitmap, settings, seconds, compilation, more) -> None:
     metadata = bitmap.metadata()
     metadata["envmap_integrator"] = envmap_integrator.__version__
     metadata["settings"] = json.dumps(settings)
     metadata["stage_times"] = json.dumps(seconds)
     metadata["compilation_time"] = compilation
-    if state:
-        metadata["cache_error"] = state.relative_error
+    for name, value in more.items():
+        metadata[name] = value
     write_bitmap(output, bitmap)
     if args.png:
         write_png(output.with_suffix(".png"), bitmap)
-    error = {"cache_error": state.relative_error} if state else {}
-    _report(args, seconds, compilation, output, **error, settings=settings)
-    return 0
 
 
 def _denoise(bitmap: mi.Bitmap, scene: mi.Scene, settings: dict[str, object]) -> None:

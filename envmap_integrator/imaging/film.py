@@ -33,71 +33,84 @@ def most_samples(sensor: mi.Sensor) -> int:
     return MAX_LANES // n_pixels_of(sensor.film())
 
 
-def expose(
+#: Sums over the samples of each pixel, row by row: one array for each channel.
+Sums = list["mi.Float"]
+
+
+def plain_sums(
     sensor: mi.Sensor,
     sampler: mi.Sampler | None,
     spp: int,
     seed: int,
     shade: Shade,
-    names: list[str],
+    n_aovs: int,
     aovs: Callable[[CameraSample], list[mi.Float]],
-) -> None:
-    """Render to the film of a sensor.
+    first: int = 0,
+) -> Sums:
+    """Render ``spp`` samples per pixel of a sensor.
 
-    ``sampler`` is one of Mitsuba's, or None for our own sample points. ``shade(sampler, ray,
-    index)`` gives the ``CameraSample`` of the sample of that index, and ``aovs`` the values of it
-    that are to go to channels of the given ``names``.
+    ``sampler`` is one of Mitsuba's, or None for our own sample points, from the ``first`` on.
+    ``shade(sampler, ray, index)`` gives the ``CameraSample`` of the sample of that index, and
+    ``aovs`` the ``n_aovs`` values of it that are to go to channels of their own.
     """
 
     def channels(found, weight):
         shown = _shown(sensor.film(), found.radiance, found.valid, weight)
         return [*shown, *(weight * value for value in aovs(found))]
 
+    return _accumulate(sensor, sampler, spp, seed, shade, channels, n_aovs, first)
+
+
+def put_plain(sensor: mi.Sensor, sums: Sums, names: list[str]) -> None:
+    """Put ``plain_sums`` to the film of the sensor, with AOVs of the given ``names``."""
     sensor.film().prepare(names)
-    _put(sensor, _accumulate(sensor, sampler, spp, seed, shade, channels, len(names)))
+    _put(sensor, sums)
 
 
-def expose_gathered(
+def gathered_sums(
     sensor: mi.Sensor,
     sampler: mi.Sampler | None,
     spp: int,
     seed: int,
     shade: Shade,
-    n_shared: int,
-    with_aovs: bool,
-) -> None:
-    """As ``expose``, with what surfaces gather taken apart and, if asked for, ``INDIRECT_AOVS``.
-
-    Pixels share what they gather with ``n_shared`` rays each, unless that is 0.
-    """
+    first: int = 0,
+) -> Sums:
+    """As ``plain_sums``, with what surfaces gather taken apart."""
 
     def channels(found, weight):
         apart = found.radiance - found.gathered.radiance
         shown = _shown(sensor.film(), apart, found.valid, weight)
         return [*shown, *found.gathered.channels()]
 
+    return _accumulate(sensor, sampler, spp, seed, shade, channels, Gathered.count(), first)
+
+
+def put_gathered(sensor: mi.Sensor, sums: Sums, n_shared: int, with_aovs: bool) -> None:
+    """Put ``gathered_sums`` to the film of the sensor and, if asked for, ``INDIRECT_AOVS``.
+
+    Pixels share what they gather with ``n_shared`` rays each, unless that is 0. The list is used
+    up: these are the largest arrays of a render, and none outlives its use.
+    """
     n_guides = Gathered.count()
-    sums = _accumulate(sensor, sampler, spp, seed, shade, channels, n_guides)
     gathered = Gathered.of_channels(sums[-n_guides:])
     del sums[-n_guides:]
     indirect = gathered.radiance
     aovs = [*rgb(gathered.radiance), *rgb(gathered.albedo)] if with_aovs else []
     if n_shared:
-        # These are the largest arrays of a render: none outlives its use.
         records = pixel_records(gathered)
         del gathered, indirect
         give_back(dr.width(records))
         width = int(sensor.film().crop_size()[0])
         indirect = filter_irradiance(records, width, tolerance(n_shared))
     for index, value in enumerate(rgb(indirect)):
-        sums[index] += value
+        sums[index] = sums[index] + value
     if with_aovs:
         sums += [*rgb(indirect), *aovs]
     sensor.film().prepare(INDIRECT_AOVS if with_aovs else [])
     _put(sensor, sums)
 
 
-def _put(sensor: mi.Sensor, sums: list[mi.Float]) -> None:
+def _put(sensor: mi.Sensor, sums: Sums) -> None:
     """Put sums over the samples of each pixel to a film that is prepared for them."""
     film = sensor.film()
     width, height = (int(n) for n in film.crop_size())
@@ -109,7 +122,7 @@ def _put(sensor: mi.Sensor, sums: list[mi.Float]) -> None:
     film.put_block(mi.ImageBlock(tensor, film.crop_offset()))
 
 
-def _accumulate(sensor, sampler, spp, seed, shade, channels, n_further) -> list[mi.Float]:
+def _accumulate(sensor, sampler, spp, seed, shade, channels, n_further, first) -> Sums:
     """Sums over the samples of each pixel, row by row, of ``channels(found, weight)``."""
     film = sensor.film()
     pixel_filter = PixelFilter(film.rfilter())
@@ -123,7 +136,7 @@ def _accumulate(sensor, sampler, spp, seed, shade, channels, n_further) -> list[
     with stage("Rendering"):
         n_channels = len(_shown(film, mi.Spectrum(0), mi.Bool(True), mi.Float(1))) + n_further
         if sampler is None:
-            sums = _lane_per_pixel(values, n_pixels, spp, seed, n_channels)
+            sums = _lane_per_pixel(values, n_pixels, spp, seed, n_channels, first)
         else:
             sums = _lane_per_sample(values, n_pixels, spp, seed, n_channels, sampler)
         dr.eval(sums)
@@ -131,7 +144,7 @@ def _accumulate(sensor, sampler, spp, seed, shade, channels, n_further) -> list[
     return sums
 
 
-def _lane_per_pixel(values, n_pixels, spp, seed, n_channels):
+def _lane_per_pixel(values, n_pixels, spp, seed, n_channels, start):
     """A lane takes the samples of one pixel in turn, or a part of them where pixels are few.
 
     Nothing is stored for a sample, and neighbouring lanes are neighbouring pixels.
@@ -140,7 +153,7 @@ def _lane_per_pixel(values, n_pixels, spp, seed, n_channels):
     lane, n_pixels_ = dr.arange(mi.UInt32, n_pixels * parts), dr.opaque(mi.UInt32, n_pixels)
     pixel, part = lane % n_pixels_, lane // n_pixels_
     least, longer = (dr.opaque(mi.UInt32, n) for n in divmod(spp, parts))
-    first = part * least + dr.minimum(part, longer)
+    first = dr.opaque(mi.UInt32, start) + part * least + dr.minimum(part, longer)
     end = first + least + dr.select(part < longer, mi.UInt32(1), 0)
     sums = [dr.zeros(mi.Float, n_pixels * parts) for _ in range(n_channels)]
     sums = _sums(values, SamplePoints.of(seed, pixel, spp, first), pixel, end, sums)

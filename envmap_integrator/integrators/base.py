@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+import math
+import time
+from collections.abc import Iterator
+
 import drjit as dr
 import mitsuba as mi
 
 from ..imaging.film import (
     INDIRECT_AOVS,
     Shade,
-    expose,
-    expose_gathered,
+    Sums,
+    gathered_sums,
     most_samples,
     n_pixels_of,
+    plain_sums,
+    put_gathered,
+    put_plain,
     rgb,
 )
+from ..imaging.progressive import Improving, improve
 from ..lookup.far_field import FarField
 from ..lookup.lookup import Lookup
 from ..preparation.baked_state import BakedState, Settings, StateKey, load
@@ -94,16 +102,22 @@ class CachedIntegrator(mi.SamplingIntegrator):
         """Values of ``aov_names``."""
         return []
 
-    def expose(
+    def sums(
         self,
         sensor: mi.Sensor,
         sampler: mi.Sampler | None,
         spp: int,
         seed: int,
         shade: Shade,
-    ) -> None:
-        """Render to the film of a sensor, as ``imaging.film.expose`` does."""
-        expose(sensor, sampler, spp, seed, shade, self.aov_names(), self.aovs)
+        first: int = 0,
+    ) -> Sums:
+        """Sums over samples of each pixel, as ``imaging.film`` has them."""
+        n_aovs = len(self.aov_names())
+        return plain_sums(sensor, sampler, spp, seed, shade, n_aovs, self.aovs, first)
+
+    def put(self, sensor: mi.Sensor, sums: Sums, spp: int) -> None:
+        """Put sums over ``spp`` samples to the film of a sensor; the list is used up."""
+        put_plain(sensor, sums, self.aov_names())
 
     def to_string(self) -> str:
         """Its parameters, for messages and the metadata of pictures."""
@@ -211,19 +225,63 @@ class CachedIntegrator(mi.SamplingIntegrator):
         film = sensor.film()
         with interruptible(), dr.suspend_grad():
             sampler, spp = self._pixel_sampler(sensor, spp)
-            lookup, rules = self._lookup(scene, baked, spp), self.rules(seed)
-
-            def shade(sampler, ray, index):
-                return camera_radiance(
-                    scene, lookup, rules.of_sample(index), sampler, ray, mi.Bool(True)
-                )
-
-            self.expose(sensor, sampler, spp, seed, shade)
+            shade = self._shade(scene, self._lookup(scene, baked, spp), seed)
+            self.put(sensor, self.sums(sensor, sampler, spp, seed, shade), spp)
             picture = film.develop() if develop else mi.TensorXf()
             if evaluate:
                 film.schedule_storage()
                 dr.eval(picture)
         return picture
+
+    def progressive(
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor | int = 0,
+        seed: int = 0,
+        spp: int = 16,
+        total: int = 256,
+        seconds: float = math.inf,
+        target_error: float = 0.0,
+    ) -> Iterator[Improving]:
+        """Render a sensor in passes of ``spp`` samples per pixel.
+
+        It ends after ``total`` samples, after so many ``seconds``, pre-passes included, or when the
+        noise that is left has a relMSE of ``target_error``. After 1, 2, 3, 4, 6, 8, 12 … passes,
+        and the last, comes a picture of all so far; the film has it too. The pre-passes are those
+        for ``total`` samples. Raises ``ValueError`` as ``prepare`` does, and if ``sampler`` isn't
+        ``coherent``.
+        """
+        deadline = time.perf_counter() + seconds
+        if self.sampler != "coherent":
+            raise ValueError(
+                f'{self.owner}: "sampler" {self.sampler} has no end of samples; leave it out'
+            )
+        if isinstance(sensor, int):
+            sensor = scene.sensors()[sensor]
+        baked = self.prepare(scene, sensor, total)
+        lookup = self._lookup(scene, baked, total)
+
+        def send(stream, index):
+            seed_ = 2 * seed + stream & 0xFFFFFFFF
+            shade = self._shade(scene, lookup, seed_)
+            return self.sums(sensor, None, spp, seed_, shade, first=index * spp)
+
+        def develop(sums, n_samples):
+            self.put(sensor, sums, n_samples)
+            picture = sensor.film().develop()
+            dr.eval(picture)
+            return picture
+
+        return improve(send, develop, spp, total, deadline, target_error)
+
+    def _shade(self, scene, lookup: Lookup, seed: int) -> Shade:
+        rules = self.rules(seed)
+
+        def shade(sampler, ray, index):
+            rules_ = rules.of_sample(index)
+            return camera_radiance(scene, lookup, rules_, sampler, ray, mi.Bool(True))
+
+        return shade
 
     def _lookup(self, scene, baked: BakedState, spp: int) -> Lookup:
         now = self._scenes(scene)
@@ -315,12 +373,20 @@ class GatheringIntegrator(CachedIntegrator):
             clamp=dr.opaque(mi.Float, self.clamp_indirect) if self.clamp_indirect else None,
         )
 
-    def expose(self, sensor, sampler, spp, seed, shade) -> None:
-        shared = self.irradiance_filter and self.residual_probability == 0
-        if not (shared or self.indirect_aovs):
-            return super().expose(sensor, sampler, spp, seed, shade)
-        n_shared = spp * self.secondary_samples if shared else 0
-        expose_gathered(sensor, sampler, spp, seed, shade, n_shared, self.indirect_aovs)
+    def sums(self, sensor, sampler, spp, seed, shade, first=0) -> Sums:
+        if not (self._shares() or self.indirect_aovs):
+            return super().sums(sensor, sampler, spp, seed, shade, first)
+        return gathered_sums(sensor, sampler, spp, seed, shade, first)
+
+    def put(self, sensor, sums, spp) -> None:
+        if not (self._shares() or self.indirect_aovs):
+            return super().put(sensor, sums, spp)
+        n_shared = spp * self.secondary_samples if self._shares() else 0
+        put_gathered(sensor, sums, n_shared, self.indirect_aovs)
+
+    def _shares(self) -> bool:
+        """Do pixels share what they gather?"""
+        return self.irradiance_filter and self.residual_probability == 0
 
     def aov_names(self) -> list[str]:
         return list(INDIRECT_AOVS) if self.indirect_aovs else []
