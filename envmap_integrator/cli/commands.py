@@ -84,7 +84,10 @@ def _improve(args, scene, sensor, settings, seconds, more, output) -> mi.Bitmap:
         f'integrator "{settings["integrator"]}" can\'t go on where it ended: pass --integrator '
         "envmap_hybrid, or leave out --progressive, --time and --target-error",
     )
-    _require(not args.denoise, "--denoise takes one picture: leave out --progressive and the like")
+    _require(
+        not args.denoise,
+        "--denoise takes one picture: leave out --progressive, --time and --target-error",
+    )
     for flag, value in (("--time", args.time), ("--target-error", args.target_error)):
         _require(value is None or value > 0, f"{flag} must be above 0, got {value}")
     asked = args.time is not None or args.target_error is not None

@@ -184,6 +184,10 @@ def too_many_samples(s: Surroundings) -> None:
     ours.render(load(room()), spp=9)
 
 
+def progressive_by_another_sampler(_: Surroundings) -> None:
+    integrator("one_level_path", sampler="independent").progressive(load(room()))
+
+
 def hide(s: Surroundings) -> Path:
     path = s.public / "state.exr"
     path.write_bytes(s.state.read_bytes())
@@ -211,6 +215,8 @@ def fill_the_disk(s: Surroundings) -> None:
 def command_line(**options: object) -> argparse.Namespace:
     defaults = {"mode": "llvm_ad_rgb", "threads": None, "define": [], "set": [], "debug": False}
     defaults |= {"integrator": None, "sensor": 0, "spp": 1, "seed": 0, "png": False}
+    defaults |= {"progressive": False, "time": None, "target_error": None}
+    defaults |= {"quiet": True, "json": False}
     return argparse.Namespace(**defaults | {"denoise": False} | options)
 
 
@@ -437,6 +443,20 @@ CASES = {
     "output": Case(shell(commands.bake, output="b.png"), "output", "b.png", "must end in .exr"),
     "no colour": Case(
         shell(commands.render, denoise=True), "--denoise", "1 channel(s)", "to rgb or rgba"
+    ),
+    "a picture that cannot improve": Case(
+        shell(commands.render, progressive=True), "integrator", '"path"',
+        "pass --integrator envmap_hybrid",
+    ),
+    "denoised while it improves": Case(
+        shell(commands.render, integrator="envmap_hybrid", progressive=True, denoise=True),
+        "--denoise", "one picture", "leave out --progressive, --time and --target-error",
+    ),
+    "no time": Case(
+        shell(commands.render, integrator="envmap_hybrid", time=0.0), "--time", "0.0", "above 0"
+    ),
+    "samples that end": Case(
+        progressive_by_another_sampler, "one_level_path", '"sampler" independent', "leave it out"
     ),
     "nothing to bake": Case(
         shell(commands.bake), "integrator", '"path"', "pass --integrator envmap_hybrid"
