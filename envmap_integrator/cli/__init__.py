@@ -31,12 +31,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     That is 0, 1 (``doctor`` found a fault), 2 (bad input) or 130 (Ctrl-C).
     """
     parser = build_parser()
-    if importlib.util.find_spec("argcomplete"):
+    # Only where a shell asks: else it would have to be imported each time.
+    if "_ARGCOMPLETE" in os.environ and importlib.util.find_spec("argcomplete"):
         import argcomplete
 
         argcomplete.autocomplete(parser)
     args = parser.parse_args(arguments)
-    progress.quiet = getattr(args, "quiet", False) or getattr(args, "json", False)
+    quiet_before = progress.quiet
+    progress.quiet |= getattr(args, "quiet", False) or getattr(args, "json", False)
     try:
         with interruptible(otherwise=_end):
             return args.command(args)
@@ -48,6 +50,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         print(f"envmap-render: {condense(error)}", file=sys.stderr)
         return EXIT_BAD_INPUT
+    finally:
+        progress.quiet = quiet_before
 
 
 def _end() -> None:

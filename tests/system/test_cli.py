@@ -16,6 +16,7 @@ from envmap_integrator.cli import main
 from envmap_integrator.cli.output import write_bitmap
 from envmap_integrator.cli.scene_file import SceneFile
 from envmap_integrator.imaging.denoiser import denoise
+from envmap_integrator.system import progress
 from envmap_integrator.system.atomic import StorageError
 from tests.helpers import at_most, unprivileged
 
@@ -88,6 +89,15 @@ def test_quiet(scene, capfd):
     assert run("render", scene, "--quiet") == 0
     assert capfd.readouterr() == ("", "")
     assert scene.with_suffix(".exr").exists()
+
+
+@pytest.mark.parametrize("before", [False, True])
+def test_quiet_is_for_one_command(scene, monkeypatch, before):
+    """A program that wants no progress bars gets none afterwards, others do."""
+    monkeypatch.setattr(progress, "quiet", before)
+    for options in ((), ("--quiet",)):
+        assert run("render", scene, *options) == 0
+        assert progress.quiet == before
 
 
 def test_json(tmp_path, capfd):
