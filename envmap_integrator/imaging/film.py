@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from operator import add
 
 import drjit as dr
 import mitsuba as mi
 
-from ..system.interrupt import not_interrupted
+from ..lookup.lookup import Lookup
+from ..system.fingerprint import SensorConstants
+from ..system.interrupt import memory, not_interrupted
 from ..system.jit import give_back
 from ..system.progress import stage
-from ..transport.camera import CameraSample
+from ..system.recording import Recorder
+from ..transport.camera import CameraSample, camera_radiance
 from ..transport.gathered import Gathered
+from ..transport.rules import PathRules
 from .irradiance_filter import filter_irradiance, pixel_records, tolerance
 from .pixel_filter import PixelFilter
-from .sample_points import SamplePoints
+from .sample_points import SamplePoints, shared_strata
 
 #: What surfaces gather, as AOVs: as in the picture, before pixels share it, and what it's in
 #: proportion to.
@@ -24,8 +29,44 @@ INDIRECT_AOVS = tuple(f"{name}.{c}" for name in ("indirect", "gathered", "albedo
 #: most, which is Dr.Jit's limit.
 MIN_LANES, MAX_LANES = 1 << 20, (1 << 32) - 1
 
-#: What finds the light of a sample: takes a sampler, the ray, and the index of the sample.
-Shade = Callable[..., CameraSample]
+
+@dataclass(frozen=True)
+class Shading:
+    """What finds the light of a sample: all that paths read, and how they go."""
+
+    scene: mi.Scene
+    lookup: Lookup
+    rules: PathRules
+
+    def __call__(
+        self, sampler: mi.Sampler | SamplePoints, ray: mi.Ray3f, index: mi.UInt32
+    ) -> CameraSample:
+        """The light that comes along the ray of the sample of an index."""
+        rules = self.rules.of_sample(index)
+        return camera_radiance(self.scene, self.lookup, rules, sampler, ray, mi.Bool(True))
+
+
+@dataclass(frozen=True)
+class Share:
+    """Which samples of a pixel a lane takes, all [1].
+
+    seed           of the sample points,
+    strata         ... and the ``shared_strata`` of all samples of a render
+    start          the first sample
+    least, longer  samples of each of the lanes that share a pixel, and how many take one more
+    """
+
+    seed: mi.UInt32
+    strata: mi.UInt32
+    start: mi.UInt32
+    least: mi.UInt32
+    longer: mi.UInt32
+
+    @classmethod
+    def of(cls, seed: int, spp: int, start: int, parts: int) -> Share:
+        """Those of ``spp`` samples from ``start`` on for ``parts`` lanes."""
+        numbers = seed & 0xFFFFFFFF, shared_strata(spp), start, *divmod(spp, parts)
+        return cls(*(dr.opaque(mi.UInt32, n) for n in numbers))
 
 
 def most_samples(sensor: mi.Sensor) -> int:
@@ -42,7 +83,8 @@ def plain_sums(
     sampler: mi.Sampler | None,
     spp: int,
     seed: int,
-    shade: Shade,
+    shading: Shading,
+    recorder: Recorder,
     n_aovs: int,
     aovs: Callable[[CameraSample], list[mi.Float]],
     first: int = 0,
@@ -50,15 +92,16 @@ def plain_sums(
     """Render ``spp`` samples per pixel of a sensor.
 
     ``sampler`` is one of Mitsuba's, or None for our own sample points, from the ``first`` on.
-    ``shade(sampler, ray, index)`` gives the ``CameraSample`` of the sample of that index, and
-    ``aovs`` the ``n_aovs`` values of it that are to go to channels of their own.
+    ``aovs`` gives the ``n_aovs`` values of a ``CameraSample`` that are to go to channels of their
+    own. Without them, ``recorder`` launches again what it has recorded.
     """
 
-    def channels(found, weight):
-        shown = _shown(sensor.film(), found.radiance, found.valid, weight)
-        return [*shown, *(weight * value for value in aovs(found))]
+    def channels(film, found, weight):
+        return [*_plain(film, found, weight), *(weight * value for value in aovs(found))]
 
-    return _accumulate(sensor, sampler, spp, seed, shade, channels, n_aovs, first)
+    if n_aovs:
+        return _accumulate(sensor, sampler, spp, seed, shading, _directly, channels, n_aovs, first)
+    return _accumulate(sensor, sampler, spp, seed, shading, recorder, _plain, 0, first)
 
 
 def put_plain(sensor: mi.Sensor, sums: Sums, names: list[str]) -> None:
@@ -72,17 +115,13 @@ def gathered_sums(
     sampler: mi.Sampler | None,
     spp: int,
     seed: int,
-    shade: Shade,
+    shading: Shading,
+    recorder: Recorder,
     first: int = 0,
 ) -> Sums:
     """As ``plain_sums``, with what surfaces gather taken apart."""
-
-    def channels(found, weight):
-        apart = found.radiance - found.gathered.radiance
-        shown = _shown(sensor.film(), apart, found.valid, weight)
-        return [*shown, *found.gathered.channels()]
-
-    return _accumulate(sensor, sampler, spp, seed, shade, channels, Gathered.count(), first)
+    n_guides = Gathered.count()
+    return _accumulate(sensor, sampler, spp, seed, shading, recorder, _apart, n_guides, first)
 
 
 def put_gathered(sensor: mi.Sensor, sums: Sums, n_shared: int, with_aovs: bool) -> None:
@@ -122,41 +161,73 @@ def _put(sensor: mi.Sensor, sums: Sums) -> None:
     film.put_block(mi.ImageBlock(tensor, film.crop_offset()))
 
 
-def _accumulate(sensor, sampler, spp, seed, shade, channels, n_further, first) -> Sums:
-    """Sums over the samples of each pixel, row by row, of ``channels(found, weight)``."""
+def _plain(film, found, weight):
+    return _shown(film, found.radiance, found.valid, weight)
+
+
+def _apart(film, found, weight):
+    apart = found.radiance - found.gathered.radiance
+    return [*_shown(film, apart, found.valid, weight), *found.gathered.channels()]
+
+
+def _directly(key, function, *inputs):
+    return function(*inputs)
+
+
+def _accumulate(sensor, sampler, spp, seed, shading, recorder, channels, n_further, first) -> Sums:
+    """Sums over the samples of each pixel, row by row, of ``channels(film, found, weight)``."""
     film = sensor.film()
-    pixel_filter = PixelFilter(film.rfilter())
     n_pixels, width = n_pixels_of(film), dr.opaque(mi.UInt32, int(film.crop_size()[0]))
-    corner = mi.Vector2i(film.crop_offset())
-
-    def values(sampler, pixel, index):
-        position = mi.Vector2i(pixel % width, pixel // width) + corner
-        return channels(*_sample(sensor, pixel_filter, sampler, shade, position, index))
-
+    n_channels = len(_shown(film, mi.Spectrum(0), mi.Bool(True), mi.Float(1))) + n_further
+    values = _Values(sensor, PixelFilter.of(film.rfilter()), width, shading, channels)
     with stage("Rendering"):
-        n_channels = len(_shown(film, mi.Spectrum(0), mi.Bool(True), mi.Float(1))) + n_further
         if sampler is None:
-            sums = _lane_per_pixel(values, n_pixels, spp, seed, n_channels, first)
+            parts = min(-(-MIN_LANES // n_pixels), spp)
+            share = Share.of(seed, spp, first, parts)
+            constants = SensorConstants(sensor)
+            record = _directly if constants.in_python else recorder
+            arguments = values, share, memory(), n_pixels, parts, n_channels
+            # What film and sampler hold would be recorded too: as mi.render leaves them.
+            film.prepare([])
+            sensor.sampler().seed(0, 1)
+            sums = record(constants, _lane_per_pixel, *arguments)
         else:
             sums = _lane_per_sample(values, n_pixels, spp, seed, n_channels, sampler)
         dr.eval(sums)
         dr.sync_thread()
-    return sums
+    return list(sums)
 
 
-def _lane_per_pixel(values, n_pixels, spp, seed, n_channels, start):
+@dataclass(frozen=True)
+class _Values:
+    """What a sample adds to the channels of its pixel."""
+
+    sensor: mi.Sensor
+    pixel_filter: PixelFilter
+    width: mi.UInt32
+    shading: Shading
+    channels: Callable[[mi.Film, CameraSample, mi.Float], list[mi.Float]]
+
+    def __call__(self, sampler, pixel, index) -> list[mi.Float]:
+        film = self.sensor.film()
+        position = mi.Vector2i(pixel % self.width, pixel // self.width)
+        position += mi.Vector2i(film.crop_offset())
+        sample = _sample(self.sensor, self.pixel_filter, sampler, self.shading, position, index)
+        return self.channels(film, *sample)
+
+
+def _lane_per_pixel(values, share, memory, n_pixels, parts, n_channels):
     """A lane takes the samples of one pixel in turn, or a part of them where pixels are few.
 
     Nothing is stored for a sample, and neighbouring lanes are neighbouring pixels.
     """
-    parts = min(-(-MIN_LANES // n_pixels), spp)
     lane, n_pixels_ = dr.arange(mi.UInt32, n_pixels * parts), dr.opaque(mi.UInt32, n_pixels)
     pixel, part = lane % n_pixels_, lane // n_pixels_
-    least, longer = (dr.opaque(mi.UInt32, n) for n in divmod(spp, parts))
-    first = dr.opaque(mi.UInt32, start) + part * least + dr.minimum(part, longer)
-    end = first + least + dr.select(part < longer, mi.UInt32(1), 0)
+    first = share.start + part * share.least + dr.minimum(part, share.longer)
+    end = first + share.least + dr.select(part < share.longer, mi.UInt32(1), 0)
     sums = [dr.zeros(mi.Float, n_pixels * parts) for _ in range(n_channels)]
-    sums = _sums(values, SamplePoints.of(seed, pixel, spp, first), pixel, end, sums)
+    points = SamplePoints.of(share.seed, pixel, share.strata, first)
+    sums = _sums(values, points, pixel, end, memory, sums)
     if parts == 1:
         return sums
     dr.eval(sums)
@@ -166,14 +237,14 @@ def _lane_per_pixel(values, n_pixels, spp, seed, n_channels, start):
 
 
 @dr.syntax
-def _sums(values, points, pixel, end, sums):
+def _sums(values, points, pixel, end, memory, sums):
     index = mi.UInt32(points.index)
     going = index < end
     # What never changes is no state of the loop: Dr.Jit would find out, and record all anew.
-    while dr.hint(going, exclude=[values, points, pixel, end], label="Samples of a pixel"):
+    while dr.hint(going, exclude=[values, points, pixel, end, memory], label="Samples of a pixel"):
         sums = [*map(add, sums, values(points.of_sample(index), pixel, index))]
         index += 1
-        going &= (index < end) & not_interrupted(index)
+        going &= (index < end) & not_interrupted(memory, index)
     return sums
 
 
@@ -193,7 +264,8 @@ def _lane_per_sample(values, n_pixels, spp, seed, n_channels, sampler):
     def leave(sampler, index):
         return sampler, index
 
-    dr.if_stmt((sampler, index), not_interrupted(index), trace, leave, mode="symbolic")
+    going = not_interrupted(memory(), index)
+    dr.if_stmt((sampler, index), going, trace, leave, mode="symbolic")
     return sums
 
 

@@ -5,6 +5,8 @@ A sample then counts for one pixel only, and the pixels' errors are independent.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -15,20 +17,32 @@ from ..system.jit import upload
 CELLS, STEPS = 8192, 1 << 14
 
 
+@dataclass(frozen=True)
 class PixelFilter:
-    """Offsets from a pixel's centre, in proportion to the size of a separable filter."""
+    """Offsets from a pixel's centre, in proportion to the size of a separable filter.
 
-    def __init__(self, rfilter: mi.ReconstructionFilter):
+    inverse   [CELLS + 1]  inverse of the filter's distribution, pixels
+    weight    [1]          of a sample, in size, for each direction
+    rfilter                the filter, if it has negative lobes
+    """
+
+    inverse: mi.Float
+    weight: float
+    rfilter: mi.ReconstructionFilter | None
+
+    @classmethod
+    def of(cls, rfilter: mi.ReconstructionFilter) -> PixelFilter:
+        """That of a film."""
         radius = rfilter.radius()
         edges = np.linspace(-radius, radius, STEPS + 1)
         middles = (edges[1:] + edges[:-1]) / 2
         value = rfilter.eval(upload(mi.Float, middles)).numpy().astype(np.float64)
         size = np.abs(value)
         # Negative lobes count negatively; the sum of weights stays that of a plain mean.
-        self._weight = float(size.sum() / value.sum())
-        self._rfilter = rfilter if (value < 0).any() else None
+        weight = float(size.sum() / value.sum())
         share = np.concatenate([[0], np.cumsum(size)]) / size.sum()
-        self._inverse = upload(mi.Float, np.interp(np.linspace(0, 1, CELLS + 1), share, edges))
+        inverse = upload(mi.Float, np.interp(np.linspace(0, 1, CELLS + 1), share, edges))
+        return cls(inverse, weight, rfilter if (value < 0).any() else None)
 
     def sample(self, u: mi.Point2f) -> tuple[mi.Vector2f, mi.Float]:
         """An offset [pixels] and its weight [1], whose mean is one."""
@@ -39,9 +53,9 @@ class PixelFilter:
     def _sample(self, u):
         cell = u * CELLS
         index = mi.UInt32(cell)
-        below = dr.gather(mi.Float, self._inverse, index)
-        above = dr.gather(mi.Float, self._inverse, index + 1)
+        below = dr.gather(mi.Float, self.inverse, index)
+        above = dr.gather(mi.Float, self.inverse, index + 1)
         x = dr.lerp(below, above, cell - mi.Float(index))
-        if self._rfilter is None:
+        if self.rfilter is None:
             return x, mi.Float(1)
-        return x, self._weight * dr.sign(self._rfilter.eval(x))
+        return x, self.weight * dr.sign(self.rfilter.eval(x))

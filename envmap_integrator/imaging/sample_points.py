@@ -23,6 +23,13 @@ from ..system.jit import LANES_ALIKE, mix, unit
 _BY_DIMENSION, _BY_LANE, _SECOND = 0x9E3779B1, 0xC13FA9A9, 0x91E10DA5
 
 
+def shared_strata(count: int) -> int:
+    """Base-2 logarithm of the number of strata that a group of lanes shares, of ``count`` samples
+    for each lane.
+    """
+    return (count & -count).bit_length() - 1
+
+
 @dataclass
 class SamplePoints:
     """Points in the unit interval and square for every sample of a pixel, as Mitsuba's samplers
@@ -30,7 +37,7 @@ class SamplePoints:
 
     pattern    [N]  hash of the seed and the group of lanes
     own        [N]  hash of the seed and the lane
-    strata     []   base-2 logarithm of the number of strata that a group of lanes shares
+    strata     []   ``shared_strata``
     index      [N]  of the sample
     dimension  [N]  how many numbers and pairs of numbers of the sample have been drawn
     """
@@ -43,16 +50,14 @@ class SamplePoints:
 
     @classmethod
     def of(
-        cls, seed: int | mi.UInt32, lane: mi.UInt32, count: int, first: mi.UInt32
+        cls, seed: mi.UInt32, lane: mi.UInt32, strata: mi.UInt32, first: mi.UInt32
     ) -> SamplePoints:
-        """Points of ``count`` samples for each lane, from the ``first`` on."""
-        seed = mi.UInt32(seed & 0xFFFFFFFF)
-        dr.make_opaque(seed)
+        """Points for each lane, from the sample ``first`` on; see ``shared_strata``."""
         seed = mix(seed + _SECOND)
         return cls(
             pattern=mix(seed ^ (lane // LANES_ALIKE) * _BY_LANE),
             own=mix(~seed ^ lane * _BY_LANE),
-            strata=dr.opaque(mi.UInt32, (count & -count).bit_length() - 1),
+            strata=strata,
             index=mi.UInt32(first),
             dimension=mi.UInt32(0),
         )

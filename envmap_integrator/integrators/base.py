@@ -11,7 +11,7 @@ import mitsuba as mi
 
 from ..imaging.film import (
     INDIRECT_AOVS,
-    Shade,
+    Shading,
     Sums,
     gathered_sums,
     most_samples,
@@ -31,6 +31,7 @@ from ..preparation.scene_state import SceneState, SceneStates
 from ..system.checks import check_not_frozen, check_scene, check_variant
 from ..system.interrupt import interruptible
 from ..system.parameters import Parameters
+from ..system.recording import Recorder
 from ..transport.camera import CameraSample, camera_radiance
 from ..transport.rules import PathRules, Residual
 
@@ -76,6 +77,8 @@ class CachedIntegrator(mi.SamplingIntegrator):
         self._scenes = SceneStates()
         self._made_for: tuple[StateKey, str] | None = None
         self._prepared: dict[tuple[Settings, str], BakedState] = {}
+        self._recorders: list[Recorder] = []
+        self._recorder = Recorder()
         self._passes = 0
 
     # ---------------------- To be overridden ----------------------
@@ -108,12 +111,12 @@ class CachedIntegrator(mi.SamplingIntegrator):
         sampler: mi.Sampler | None,
         spp: int,
         seed: int,
-        shade: Shade,
+        shading: Shading,
         first: int = 0,
     ) -> Sums:
         """Sums over samples of each pixel, as ``imaging.film`` has them."""
-        n_aovs = len(self.aov_names())
-        return plain_sums(sensor, sampler, spp, seed, shade, n_aovs, self.aovs, first)
+        n_aovs, recorder = len(self.aov_names()), self._recorder
+        return plain_sums(sensor, sampler, spp, seed, shading, recorder, n_aovs, self.aovs, first)
 
     def put(self, sensor: mi.Sensor, sums: Sums, spp: int) -> None:
         """Put sums over ``spp`` samples to the film of a sensor; the list is used up."""
@@ -225,8 +228,8 @@ class CachedIntegrator(mi.SamplingIntegrator):
         film = sensor.film()
         with interruptible(), dr.suspend_grad():
             sampler, spp = self._pixel_sampler(sensor, spp)
-            shade = self._shade(scene, self._lookup(scene, baked, spp), seed)
-            self.put(sensor, self.sums(sensor, sampler, spp, seed, shade), spp)
+            shading = Shading(scene, self._lookup(scene, baked, spp), self.rules(seed))
+            self.put(sensor, self.sums(sensor, sampler, spp, seed, shading), spp)
             picture = film.develop() if develop else mi.TensorXf()
             if evaluate:
                 film.schedule_storage()
@@ -263,8 +266,8 @@ class CachedIntegrator(mi.SamplingIntegrator):
 
         def send(stream, index):
             seed_ = 2 * seed + stream & 0xFFFFFFFF
-            shade = self._shade(scene, lookup, seed_)
-            return self.sums(sensor, None, spp, seed_, shade, first=index * spp)
+            shading = Shading(scene, lookup, self.rules(seed_))
+            return self.sums(sensor, None, spp, seed_, shading, first=index * spp)
 
         def develop(sums, n_samples):
             self.put(sensor, sums, n_samples)
@@ -274,18 +277,21 @@ class CachedIntegrator(mi.SamplingIntegrator):
 
         return improve(send, develop, spp, total, deadline, target_error)
 
-    def _shade(self, scene, lookup: Lookup, seed: int) -> Shade:
-        rules = self.rules(seed)
-
-        def shade(sampler, ray, index):
-            rules_ = rules.of_sample(index)
-            return camera_radiance(scene, lookup, rules_, sampler, ray, mi.Bool(True))
-
-        return shade
-
     def _lookup(self, scene, baked: BakedState, spp: int) -> Lookup:
         now = self._scenes(scene)
-        return now.lookup(baked, self.maps_for(scene, now, baked, spp))
+        maps = self.maps_for(scene, now, baked, spp)
+        self._recorder = self._recorder_of(now, baked, maps)
+        return now.lookup(baked, maps)
+
+    def _recorder_of(self, now: SceneState, baked: BakedState, maps: FarField | None) -> Recorder:
+        """The same one as long as nothing in the scene has been replaced."""
+        self._recorders = [r for r in self._recorders if r.about[0] is now][-MOST_STATES:]
+        for recorder in self._recorders:
+            if recorder.is_about(now, baked, maps):
+                return recorder
+        possible = not now.content.in_python
+        self._recorders.append(Recorder(now, baked, maps, possible=possible))
+        return self._recorders[-1]
 
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0) -> None:
         """Raises ``NotImplementedError``."""
@@ -373,10 +379,10 @@ class GatheringIntegrator(CachedIntegrator):
             clamp=dr.opaque(mi.Float, self.clamp_indirect) if self.clamp_indirect else None,
         )
 
-    def sums(self, sensor, sampler, spp, seed, shade, first=0) -> Sums:
+    def sums(self, sensor, sampler, spp, seed, shading, first=0) -> Sums:
         if not (self._shares() or self.indirect_aovs):
-            return super().sums(sensor, sampler, spp, seed, shade, first)
-        return gathered_sums(sensor, sampler, spp, seed, shade, first)
+            return super().sums(sensor, sampler, spp, seed, shading, first)
+        return gathered_sums(sensor, sampler, spp, seed, shading, self._recorder, first)
 
     def put(self, sensor, sums, spp) -> None:
         if not (self._shares() or self.indirect_aovs):

@@ -19,30 +19,39 @@ from ..system.scene_order import ordered_emitters
 ALMOST_ONE = 1 - 2**-24
 
 
+@dataclass(frozen=True)
 class Emitters:
     """The emitters of a scene, as ``ordered_emitters`` counts them.
 
     count      number of emitters L
     size       [1]  the same where kernels read it as data: other numbers compile nothing
     pointers   [L]
+    table      index of each of Dr.Jit's ids
     weights    [L]  their ``sampling_weight``, in sum 1
     """
 
-    def __init__(self, scene: mi.Scene):
+    count: int
+    size: mi.UInt32
+    pointers: mi.EmitterPtr
+    table: mi.UInt32
+    weights: np.ndarray
+
+    @classmethod
+    def of(cls, scene: mi.Scene) -> Emitters:
+        """Those of a scene."""
         emitters = ordered_emitters(scene)
-        self.count = len(emitters)
-        self.pointers = mi.EmitterPtr(emitters)
+        count, pointers = len(emitters), mi.EmitterPtr(emitters)
         weights = np.array([emitter.sampling_weight() for emitter in emitters], dtype=np.float64)
-        self.weights = weights / max(weights.sum(), 1e-30)
-        self.size = dr.opaque(mi.UInt32, self.count)
-        registry_ids = dr.reinterpret_array(mi.UInt32, self.pointers).numpy()
+        weights /= max(weights.sum(), 1e-30)
+        registry_ids = dr.reinterpret_array(mi.UInt32, pointers).numpy()
         table = np.zeros(int(registry_ids.max(initial=0)) + 1, dtype=np.uint32)
-        table[registry_ids] = np.arange(self.count, dtype=np.uint32)
-        self._table = upload(mi.UInt32, table)
+        table[registry_ids] = np.arange(count, dtype=np.uint32)
+        size = dr.opaque(mi.UInt32, count)
+        return cls(count, size, pointers, upload(mi.UInt32, table), weights)
 
     def index(self, emitter: mi.EmitterPtr, active: mi.Bool | bool = True) -> mi.UInt32:
         """Index of each emitter."""
-        return dr.gather(mi.UInt32, self._table, dr.reinterpret_array(mi.UInt32, emitter), active)
+        return dr.gather(mi.UInt32, self.table, dr.reinterpret_array(mi.UInt32, emitter), active)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -10,23 +12,31 @@ from ..system.jit import upload
 from ..system.scene_order import ordered_shapes
 
 
+@dataclass(frozen=True)
 class ObjectIds:
     """Dense index of the top-level shape under an interaction, as ``ordered_shapes`` counts them.
 
     Dr.Jit's own registry ids are global to the process and change from run to run; these don't,
     so what is stored by object id can be saved.
+
+    count   number of shapes
+    table   index of each of Dr.Jit's ids
     """
 
-    def __init__(self, scene: mi.Scene):
+    count: int
+    table: mi.UInt32
+
+    @classmethod
+    def of(cls, scene: mi.Scene) -> ObjectIds:
+        """Those of the shapes of a scene."""
         shapes = mi.ShapePtr(ordered_shapes(scene))
         registry_ids = dr.reinterpret_array(mi.UInt32, shapes).numpy()
         table = np.zeros(int(registry_ids.max(initial=0)) + 1, dtype=np.uint32)
         table[registry_ids] = np.arange(len(registry_ids), dtype=np.uint32)
-        self.count = len(registry_ids)
-        self._table = upload(mi.UInt32, table)
+        return cls(len(registry_ids), upload(mi.UInt32, table))
 
     def __call__(self, si: mi.SurfaceInteraction3f) -> mi.UInt32:
         shape = dr.reinterpret_array(mi.UInt32, si.shape)
         instance = dr.reinterpret_array(mi.UInt32, si.instance)
         index = dr.select(instance != 0, instance, shape)
-        return dr.gather(mi.UInt32, self._table, index, si.is_valid())
+        return dr.gather(mi.UInt32, self.table, index, si.is_valid())

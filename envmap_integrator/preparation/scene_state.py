@@ -26,7 +26,7 @@ class SceneState:
 
     def __init__(self, scene: mi.Scene, content: SceneContent, fingerprint: str):
         self.content, self.fingerprint = content, fingerprint
-        self.ids, self.emitters = ObjectIds(scene), Emitters(scene)
+        self.ids, self.emitters = ObjectIds.of(scene), Emitters.of(scene)
         self._maps: tuple[BakedState, tuple, FarField] | None = None
 
     def lookup(self, baked: BakedState, maps: FarField | None) -> Lookup:

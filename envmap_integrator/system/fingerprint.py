@@ -48,9 +48,37 @@ class SceneContent:
 
     __hash__ = None
 
+    @property
+    def in_python(self) -> bool:
+        """Is a plugin of it written in Python? What such depend on can't be known."""
+        return _in_python(self._objects)
+
     def of_kind(self, kind: type) -> list[_Object]:
         """Those of all objects that are of a class of Mitsuba's."""
         return [item for item in self._objects.values() if isinstance(item.itself, kind)]
+
+
+class SensorConstants:
+    """What kernels take for granted of a sensor: the objects that it's made of, and their numbers.
+
+    Arrays, such as where it stands, aren't among them. What it's told by is held on to.
+    """
+
+    def __init__(self, sensor: mi.Sensor):
+        self._objects: dict[int, _Object] = {}
+        _object(sensor, self._objects)
+        self._constants = [(item.itself.ptr, item.values) for item in self._objects.values()]
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, SensorConstants) and self._constants == other._constants
+
+    def __hash__(self) -> int:
+        return hash(tuple(self._objects))
+
+    @property
+    def in_python(self) -> bool:
+        """Is a plugin of it written in Python?"""
+        return _in_python(self._objects)
 
 
 class SceneFingerprint:
@@ -141,6 +169,11 @@ class _Object:
             tuple(map(_index, self.arrays.values())),
             tuple(child.ptr for _, child in self.children),
         )
+
+
+def _in_python(objects: dict[int, _Object]) -> bool:
+    modules = (type(item.itself).__module__ for item in objects.values())
+    return not all(module.split(".")[0] == "mitsuba" for module in modules)
 
 
 def _object(itself: mi.Object, known: dict[int, _Object]) -> _Object:

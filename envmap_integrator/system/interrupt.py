@@ -77,9 +77,19 @@ def _watch(reader, outer, pressed, left, otherwise) -> None:
             otherwise()
 
 
-def not_interrupted(step: mi.UInt32) -> mi.Bool:
-    """Whether Ctrl-C hasn't been pressed, as kernels see it while they run.
+def memory() -> mi.UInt32:
+    """Where kernels look."""
+    return mi.UInt32(_memory)
+
+
+def not_interrupted(memory: mi.UInt32, step: mi.UInt32) -> mi.Bool:
+    """Whether Ctrl-C hasn't been pressed, as kernels see it in ``memory()`` while they run.
 
     ``step`` counts what the kernel repeats: without it, the compiler would look once and for all.
     """
-    return dr.gather(mi.UInt32, mi.UInt32(_memory), step % len(_memory)) == 0
+    return dr.gather(mi.UInt32, memory, step % len(_memory)) == 0
+
+
+def was_interrupted() -> bool:
+    """Whether Ctrl-C has been pressed in a block of ``interruptible``."""
+    return bool(_memory[0])

@@ -56,6 +56,11 @@ def count_rays() -> Iterator[dict[str, int]]:
     counts.update(zip(names, counter.numpy().tolist(), strict=True))
 
 
+def counting() -> bool:
+    """Does anybody count?"""
+    return _counter is not None
+
+
 def count(kind: Ray, ray: mi.Ray3f | mi.DirectionSample3f, active: mi.Bool) -> None:
     """Count one ray of each active lane; ``ray`` tells how many lanes there are."""
     if _counter is not None:

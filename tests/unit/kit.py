@@ -71,16 +71,16 @@ class CoarseMesh(build.CoarseMesh):
 
     def lookup(self) -> Lookup:
         """What paths look up while there is no cache."""
-        return Lookup(self.patches, self.object_ids, by_weight(Emitters(self.scene)))
+        return Lookup(self.patches, self.object_ids, by_weight(Emitters.of(self.scene)))
 
 
 def coarse_mesh(scene: mi.Scene, budget: int = 1024, points_per_patch: int = 128) -> CoarseMesh:
-    points = scatter_points(scene, ObjectIds(scene), points_per_patch * budget, scene.sensors())
+    points = scatter_points(scene, ObjectIds.of(scene), points_per_patch * budget, scene.sensors())
     return coarse_mesh_over(scene, points, budget)
 
 
 def coarse_mesh_over(scene: mi.Scene, points: SurfacePoints, budget: int) -> CoarseMesh:
-    object_ids = ObjectIds(scene)
+    object_ids = ObjectIds.of(scene)
     built = build.build_mesh(points, object_ids, budget)
     return CoarseMesh(**vars(built), scene=scene, object_ids=object_ids)
 

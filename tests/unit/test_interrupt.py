@@ -12,7 +12,7 @@ import mitsuba as mi
 import pytest
 
 from envmap_integrator.system import interrupt
-from envmap_integrator.system.interrupt import interruptible, not_interrupted
+from envmap_integrator.system.interrupt import interruptible, memory, not_interrupted
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -27,7 +27,9 @@ def count_up(limit: int) -> mi.UInt32:
     """How far lanes get."""
     i = dr.zeros(mi.UInt32, 64)
     return dr.while_loop(
-        (i,), lambda i: (i < dr.opaque(mi.UInt32, limit)) & not_interrupted(i), lambda i: (i + 1,)
+        (i,),
+        lambda i: (i < dr.opaque(mi.UInt32, limit)) & not_interrupted(memory(), i),
+        lambda i: (i + 1,),
     )[0]
 
 

@@ -31,7 +31,7 @@ def rfilter(request, variant):
 def sampled(rfilter) -> tuple[np.ndarray, np.ndarray]:
     """Offsets [2, N] and weights [N] of well spread numbers."""
     u = qmc.Sobol(2, seed=0).random_base2(18)
-    offset, weight = PixelFilter(rfilter).sample(mi.Point2f(*(upload(mi.Float, a) for a in u.T)))
+    offset, weight = PixelFilter.of(rfilter).sample(mi.Point2f(*(upload(mi.Float, a) for a in u.T)))
     return offset.numpy(), np.broadcast_to(weight.numpy(), len(u))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from envmap_integrator.imaging.sample_points import SamplePoints
+from envmap_integrator.imaging.sample_points import SamplePoints, shared_strata
 from envmap_integrator.system.jit import LANES_ALIKE
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -18,10 +18,14 @@ DIMENSIONS = 3
 SIGNIFICANCE = 1e-6
 
 
+def points_of(lane: mi.UInt32, count: int, first: mi.UInt32, seed: int = 0) -> SamplePoints:
+    return SamplePoints.of(mi.UInt32(seed % 2**32), lane, mi.UInt32(shared_strata(count)), first)
+
+
 def draw(count: int, lanes: int, seed: int = 0, pairs: bool = True) -> np.ndarray:
     """All samples of some lanes, [dimension, sample, lane, 2 or 1]."""
     lane = dr.arange(mi.UInt32, lanes * count)
-    points = SamplePoints.of(seed, lane % lanes, count, lane // lanes)
+    points = points_of(lane % lanes, count, lane // lanes, seed)
     found = []
     for _ in range(DIMENSIONS):
         drawn = points.next_2d() if pairs else mi.Vector1f(points.next_1d())
@@ -123,9 +127,9 @@ def test_seeds_give_other_points():
 def test_points_of_another_sample():
     """One after the other, points are those of a later start."""
     lane = dr.arange(mi.UInt32, 32)
-    points = SamplePoints.of(0, lane, 8, mi.UInt32(2))
+    points = points_of(lane, 8, mi.UInt32(2))
     points.next_1d()
     points.next_2d()
     points = points.of_sample(mi.UInt32(3))
-    later = SamplePoints.of(0, lane, 8, mi.UInt32(3))
+    later = points_of(lane, 8, mi.UInt32(3))
     np.testing.assert_array_equal(points.next_2d().numpy(), later.next_2d().numpy())

@@ -63,7 +63,7 @@ def choice(hall) -> EmitterChoice:
 
 
 def choice_in(hall) -> EmitterChoice:
-    emitters = Emitters(hall.scene)
+    emitters = Emitters.of(hall.scene)
     return choose_emitters(emitters, survey_direct_light(hall.scene, emitters, hall), hall)
 
 
@@ -167,7 +167,7 @@ def test_many_lamps_are_told_apart():
 def test_sampling_weights_count():
     """Those of weight 0 are never chosen; the others in proportion where nothing is known."""
     scene = scene_of(lamp_at(-1, sampling_weight=0.0), lamp_at(0, sampling_weight=3.0), lamp_at(1))
-    emitters = Emitters(scene)
+    emitters = Emitters.of(scene)
     assert sorted(emitters.weights) == pytest.approx([0, 0.25, 0.75])
     n = 4096
     sampler = mi.load_dict({"type": "independent"})
@@ -183,7 +183,7 @@ def test_sampling_weights_count():
 def test_a_scene_without_emitters_has_nothing_to_choose():
     scene = scene_of({"type": "sphere"})
     si = dr.zeros(mi.SurfaceInteraction3f, 4)
-    ds, weight = by_weight(Emitters(scene)).sample_direction(
+    ds, weight = by_weight(Emitters.of(scene)).sample_direction(
         si, mi.UInt32(0), mi.Point2f(0.5), True
     )
     assert np.all(ds.pdf.numpy() == 0) and np.all(weight.numpy() == 0)
@@ -194,6 +194,6 @@ def test_the_largest_random_number_is_in_the_last_bin():
     scene = scene_of(lamp_at(-1), lamp_at(1))
     si = dr.zeros(mi.SurfaceInteraction3f, 1)
     u = mi.Point2f(1 - 2**-24, 0.5)
-    choice = EmitterChoice(Emitters(scene), table, mi.UInt32(0))
+    choice = EmitterChoice(Emitters.of(scene), table, mi.UInt32(0))
     ds, _ = choice.sample_direction(si, mi.UInt32(0), u, True)
     assert np.isfinite(ds.p.numpy()).all()

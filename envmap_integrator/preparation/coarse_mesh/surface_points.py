@@ -323,7 +323,16 @@ def _hits_along(
     active = dr.full(mi.Bool, True, n_rays)
     while dr.hint(
         active,
-        exclude=[positions, normals, shading_normals, object_of_point, kept, turned, reflects],
+        exclude=[
+            object_ids,
+            positions,
+            normals,
+            shading_normals,
+            object_of_point,
+            kept,
+            turned,
+            reflects,
+        ],
         label="Scatter points",
     ):
         count(Ray.SURVEY, ray, active)
