@@ -148,6 +148,10 @@ class CachedIntegrator(mi.SamplingIntegrator):
         Raises ``ValueError`` for scenes that can't be rendered and for a ``cache_file`` that is
         missing, damaged, or of another scene, other settings or other views.
         """
+        return self._ready(scene, sensor, spp)[1]
+
+    def _ready(self, scene, sensor, spp) -> tuple[SceneState, BakedState]:
+        """The scene as it is now, and what has been prepared for a render of a sensor."""
         check_not_frozen(self.owner)
         settings = self.settings()
         now = self._scenes(scene)
@@ -178,7 +182,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
                     "scene"
                 )
             self._keep(settings, name, state)
-        return self._prepared[settings, name]
+        return now, self._prepared[settings, name]
 
     def _keep(self, settings: Settings, view: str, state: BakedState) -> None:
         """Remember which state serves a view, and forget the oldest of many states."""
@@ -224,11 +228,11 @@ class CachedIntegrator(mi.SamplingIntegrator):
         """
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
-        baked = self.prepare(scene, sensor, spp)
+        now, baked = self._ready(scene, sensor, spp)
         film = sensor.film()
         with interruptible(), dr.suspend_grad():
             sampler, spp = self._pixel_sampler(sensor, spp)
-            shading = Shading(scene, self._lookup(scene, baked, spp), self.rules(seed))
+            shading = Shading(scene, self._lookup(scene, now, baked, spp), self.rules(seed))
             self.put(sensor, self.sums(sensor, sampler, spp, seed, shading), spp)
             picture = film.develop() if develop else mi.TensorXf()
             if evaluate:
@@ -261,8 +265,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
             )
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
-        baked = self.prepare(scene, sensor, total)
-        lookup = self._lookup(scene, baked, total)
+        lookup = self._lookup(scene, *self._ready(scene, sensor, total), total)
 
         def send(stream, index):
             seed_ = 2 * seed + stream & 0xFFFFFFFF
@@ -277,8 +280,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
 
         return improve(send, develop, spp, total, deadline, target_error)
 
-    def _lookup(self, scene, baked: BakedState, spp: int) -> Lookup:
-        now = self._scenes(scene)
+    def _lookup(self, scene, now: SceneState, baked: BakedState, spp: int) -> Lookup:
         maps = self.maps_for(scene, now, baked, spp)
         self._recorder = self._recorder_of(now, baked, maps)
         return now.lookup(baked, maps)
@@ -341,7 +343,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
                 f"{self.owner}: within another integrator only sensors of the scene are known, and "
                 "there are none; add the sensor to the scene"
             )
-        lookup = self._lookup(scene, self.prepare(scene), sampler.sample_count())
+        lookup = self._lookup(scene, *self._ready(scene, None, 0), sampler.sample_count())
         self._passes += 1
         rules = self.rules(self._passes)
         ray, active = mi.Ray3f(ray), mi.Bool(active)
