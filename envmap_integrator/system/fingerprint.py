@@ -61,13 +61,20 @@ class SceneContent:
 class SensorConstants:
     """What kernels take for granted of a sensor: the objects that it's made of, and their numbers.
 
-    Arrays, such as where it stands, aren't among them. What it's told by is held on to.
+    Arrays, such as where it stands, aren't among them if the sensor shows Dr.Jit all of its own.
+    What it's told by is held on to.
     """
+
+    #: Others keep arrays to themselves, at least thinlens and orthographic.
+    OPEN = ("PerspectiveCamera",)
 
     def __init__(self, sensor: mi.Sensor):
         self._objects: dict[int, _Object] = {}
         _object(sensor, self._objects)
-        self._constants = [(item.itself.ptr, item.values) for item in self._objects.values()]
+        if sensor.class_name() in self.OPEN:
+            self._constants = [(item.itself.ptr, item.values) for item in self._objects.values()]
+        else:
+            self._constants = [item.identity for item in self._objects.values()]
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, SensorConstants) and self._constants == other._constants

@@ -30,6 +30,7 @@ class Recorder:
         self.about = about
         self._frozen: dict[Hashable, Callable] = {}
         self._possible = possible
+        self._impossible: set[Hashable] = set()
 
     def is_about(self, *objects: object) -> bool:
         """Is it for these very objects?"""
@@ -42,7 +43,7 @@ class Recorder:
         dataclasses and objects of Mitsuba's. It's recorded anew if anything else in them differs,
         or ``key``, which stands for what they don't show.
         """
-        if not self._possible or counting():
+        if not self._possible or key in self._impossible or counting():
             return function(*inputs)
         try:
             return self._frozen_of(key)(function, *inputs)
@@ -52,7 +53,7 @@ class Recorder:
                 raise cause from None
         # It reads an array that isn't among the inputs, or that a plugin doesn't show.
         mi.Log(mi.LogLevel.Debug, f"can't be recorded, and takes longer: {cause}")
-        self._possible = False
+        self._impossible.add(key)
         return function(*inputs)
 
     def _frozen_of(self, key: Hashable) -> Callable:

@@ -92,7 +92,8 @@ def edit(**changes) -> Callable:
         parameters = mi.traverse(scene)
         for ending, value in changes.items():
             key = next(name for name in parameters.keys() if name.endswith(ending))
-            parameters[key] = type(parameters[key])(value)
+            before = parameters[key]
+            parameters[key] = value(before) if callable(value) else type(before)(value)
         parameters.update()
 
     return change
@@ -157,6 +158,31 @@ def test_sensors_and_films_in_turn(recordings):
         for view, expected in zip(views, first, strict=True):
             assert np.array_equal(picture(scene, renderer, view), expected)
     assert recordings() == before
+
+
+LENSES = {
+    "perspective": ({}, {"x_fov": 40.0}),
+    "thinlens": ({"aperture_radius": 0.05, "focus_distance": 2.0}, {"focus_distance": 0.5}),
+    "orthographic": ({"fov": None}, {"near_clip": 1.0}),
+}
+
+
+@pytest.mark.parametrize("kind", LENSES)
+def test_sensors_that_keep_arrays_to_themselves(kind):
+    """Dr.Jit doesn't find all that some of Mitsuba's sensors read."""
+    settings, changes = LENSES[kind]
+    description = camera(16, 12, type=kind) | settings
+    scene = load(room(sensor={name: v for name, v in description.items() if v is not None}))
+    renderer = new()
+    pictures = [picture(scene, renderer), picture(scene, renderer, seed=2)]
+    edit(**changes)(scene, renderer)
+    pictures.append(picture(scene, renderer))
+    assert np.array_equal(pictures[2], traced(scene, renderer))
+    move = mi.Transform4f().translate([0.1, 0.2, 0])
+    edit(to_world=lambda before: move @ before)(scene, renderer)
+    pictures.append(picture(scene, renderer))
+    assert np.array_equal(pictures[3], traced(scene, renderer))
+    assert not any(np.array_equal(pictures[0], other) for other in pictures[1:])
 
 
 def test_other_integrators_and_scenes_in_between_change_nothing():

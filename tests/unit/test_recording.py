@@ -95,6 +95,10 @@ def test_what_can_not_be_recorded_is_run():
     calls.clear()
     recorder(None, function, of(4))
     assert len(calls) == 1, "it isn't tried again"
+    calls.clear()
+    for _ in range(2):
+        recorder("another key", sum_of, Line(of(1), 2), of(1, 2))
+    assert len(calls) == 1, "others are recorded"
 
 
 def test_nothing_is_recorded_where_that_is_not_possible():
