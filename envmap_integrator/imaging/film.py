@@ -63,10 +63,12 @@ class Share:
     longer: mi.UInt32
 
     @classmethod
-    def of(cls, seed: int, spp: int, start: int, parts: int) -> Share:
+    def of(cls, seed: int | mi.UInt32, spp: int, start: int, parts: int) -> Share:
         """Those of ``spp`` samples from ``start`` on for ``parts`` lanes."""
         numbers = seed & 0xFFFFFFFF, shared_strata(spp), start, *divmod(spp, parts)
-        return cls(*(dr.opaque(mi.UInt32, n) for n in numbers))
+        share = cls(*map(mi.UInt32, numbers))
+        dr.make_opaque(share)
+        return share
 
 
 def most_samples(sensor: mi.Sensor) -> int:

@@ -54,6 +54,7 @@ EXCEPTED = {
     """raise ValueError("sizes that can't be true")""",
     "raise MemoryError",
     "raise error",
+    "raise cause from None",
     "raise KeyboardInterrupt from error",
 }
 MEDIUM = {"type": "homogeneous", "albedo": 0.5, "sigma_t": 1.0}
