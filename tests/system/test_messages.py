@@ -22,6 +22,7 @@ from compare.hard_cases import empty_mesh
 from envmap_integrator.cli import commands
 from envmap_integrator.cli.scene_file import SceneFile, parse_assignment
 from envmap_integrator.imaging import film
+from envmap_integrator.imaging.aovs import parse_aovs
 from envmap_integrator.imaging.denoiser import warm_up
 from envmap_integrator.preparation.maps.clusters import ClusterRequest, listed_clusters
 from envmap_integrator.system import memory, storage
@@ -110,6 +111,10 @@ def emitter(**parameters: object) -> Callable:
         {"type": "mipmap_cube", "id": "sky"}
         | {key: str(v(s)) if key == "filename" else v for key, v in parameters.items()}
     )
+
+
+def aovs(text: str) -> Callable:
+    return lambda _: parse_aovs(text, "ours")
 
 
 def frozen(_: Surroundings) -> None:
@@ -306,6 +311,8 @@ CASES = {
     "choice": Case(parameter("choice", "c", "a", ("a", "b")), '"x"', "'c'", '"a" or "b"'),
     "text": Case(parameter("text", 3), '"x"', "3", "must be a string"),
     "range": Case(parameter("integer", 9, 1, 1, 8), '"x"', "9", "at least 1 and at most 8"),
+    "AOV": Case(aovs("p:patch, depth"), "ours", '"depth"', "must list name:type"),
+    "AOV twice": Case(aovs("a:patch, a:served"), "ours", 'two of the name "a"', "rename one"),
     "nested": Case(
         lambda _: integrator("envmap_hybrid", cube={"type": "point"}),
         "envmap_hybrid", 'PointLight "cube"', "must be one envmap_bake or a mipmap_cube",
