@@ -93,12 +93,11 @@ class EnvmapHybrid(GatheringIntegrator):
          The denoiser takes it apart from direct light. (Default: false)
      * - aovs
        - |string|
-       - AOVs in the syntax of Mitsuba's :monosp:`aov`, such as ``p:patch, s:served``, of the first
-         surface that isn't a mirror or glass. ``patch``: a colour for each patch of the cache;
-         ``irradiance``, ``indirect_irradiance``, ``irradiance_error``: what the cache holds there,
-         and the standard error of that [W/m²]; ``cluster``: a colour for each cluster with a map;
-         ``served``: part of the secondary rays that were traced on (R), ended in the cache (G) or
-         in a map (B). (Default: none)
+       - AOVs as in Mitsuba's :monosp:`aov`, such as ``p:patch, s:served``: ``patch`` and
+         ``cluster``, a colour for each; ``irradiance``, ``indirect_irradiance``,
+         ``irradiance_error``: what the cache holds, and its standard error [W/m²]; ``served``: part
+         of the secondary rays that were traced on (R), ended in the cache (G) or in a map (B).
+         (Default: none)
      * - clamp_indirect
        - |float|
        - Largest radiance [W/m²/sr] that a secondary ray may bring: cuts fireflies, and the light of

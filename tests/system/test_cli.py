@@ -121,7 +121,7 @@ def test_quiet_or_json(scene, capsys):
     assert "not allowed with" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", [(), ("render",), ("bake",)])
+@pytest.mark.parametrize("command", [(), ("render",), ("bake",), ("inspect",)])
 def test_help_teaches(capsys, command):
     with pytest.raises(SystemExit, match="0"):
         run(*command, "--help")
