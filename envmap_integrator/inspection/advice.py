@@ -19,8 +19,8 @@ MOST_SHAPES = 6
 
 
 def percent(share: float) -> str:
-    """A share as people read it."""
-    return f"{100 * share:.2g} %" if share < 0.1 else f"{100 * share:.0f} %"
+    """A share as people read it, on one line."""
+    return f"{100 * share:.2g}\u00a0%" if share < 0.1 else f"{100 * share:.0f}\u00a0%"
 
 
 def in_short(survey: Survey) -> list[str]:

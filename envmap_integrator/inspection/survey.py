@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from itertools import groupby
+from itertools import groupby, islice
 
 import drjit as dr
 import mitsuba as mi
@@ -62,7 +62,7 @@ class Survey:
 
     picture, spp  [H, W, 3] linear, and its samples per pixel
     noise         relMSE that is left in it by noise
-    pass_seconds  of so many samples as half the picture has
+    timed         samples per pixel of its last pass, and the seconds that it took
     view          what was prepared for the render that is asked for
     mapped        the same if maps were made in any case, None if that is so already
     patches       numbers of patches: in use, of these for indirect light alone, and left out
@@ -73,7 +73,7 @@ class Survey:
     picture: np.ndarray
     spp: int
     noise: float
-    pass_seconds: float
+    timed: tuple[int, float]
     view: View
     mapped: View | None
     patches: tuple[int, int, int]
@@ -89,31 +89,28 @@ def survey(
     Raises ``ValueError`` as ``integrator.prepare`` does.
     """
     with _warnings() as warnings:
-        integrator.prepare(scene, sensor, spp)
-        passes = integrator.progressive(scene, sensor, seed, PICTURE_SPP // 2, spp)
-        better = next(passes)
-        begin = time.perf_counter()
-        better = next(passes, better)
-        seconds = time.perf_counter() - begin
-        picture = np.array(better.picture, np.float32)
+        each, begin = max(min(PICTURE_SPP, spp) // 2, 1), time.perf_counter()
+        for better in islice(integrator.progressive(scene, sensor, seed, each, spp), 2):
+            picture, reached, noise = np.array(better.picture), better.spp, better.error
+            now = time.perf_counter()
+            seconds, begin = now - begin, now
         view = _view(scene, sensor, integrator, spp, seed, tuple(TYPES))
         mapped = None
-        if (
-            not view.state.maps
-            and getattr(integrator, "maps", "") == "auto"
-            and not (integrator.cache_file)
-        ):
+        automatic = getattr(integrator, "maps", "") == "auto" and not integrator.cache_file
+        if automatic and not view.state.maps:
             integrator.maps = "always"
-            mapped = _view(scene, sensor, integrator, spp, seed, ("cluster", "served"))
-            integrator.maps = "auto"
+            try:
+                mapped = _view(scene, sensor, integrator, spp, seed, ("cluster", "served"))
+            finally:
+                integrator.maps = "auto"
     settings = integrator.settings().for_render(n_pixels_of(sensor.film()) * spp)
     if picture.shape[2] < 3:  # Luminance, and alpha.
         picture = np.repeat(picture[..., :1], 3, axis=2)
     return Survey(
         picture[..., :3],
-        better.spp,
-        better.error,
-        seconds,
+        reached,
+        noise,
+        (each, seconds),
         view,
         mapped,
         _patches(view.state),
@@ -131,13 +128,14 @@ def _patches(state: BakedState) -> tuple[int, int, int]:
 
 
 def _view(scene, sensor, integrator, spp, seed, types: tuple[str, ...]) -> View:
+    before = integrator.aovs
     integrator.aovs = ", ".join(f"{kind}:{kind}" for kind in types)
     try:
         passes = integrator.progressive(scene, sensor, seed, min(AOV_SPP, spp), spp)
         channels = np.array(next(passes).picture)
         names = integrator.aov_names()
     finally:
-        integrator.aovs = ""
+        integrator.aovs = before
     aovs, begin = {}, channels.shape[2] - len(names)
     for kind, group in groupby(names, lambda name: name.partition(".")[0]):
         end = begin + len(list(group))

@@ -118,6 +118,7 @@ def test_a_survey_is_of_the_render_asked_for():
     tables = (s.cache.table.numpy() for s in (found.view.state, ours.prepare(scene, spp=64)))
     np.testing.assert_array_equal(*tables)
     assert (ours.maps, ours.aovs) == ("auto", "")
+    assert found.spp == 16 and found.timed[0] == 8 and found.timed[1] > 0
     assert found.mapped is not None and found.mapped.state.maps
     assert found.picture.shape == (HEIGHT, WIDTH, 3) and 0 < found.noise < 1
     for view in found.mapped.clusters:
@@ -256,7 +257,7 @@ def test_scales():
         ((0.1, 0.2, 0.7), 0.5, "Nothing odd"),
         ((0.1, 0.7, 0.2), 0.5, "lower distance_ratio (here 2)"),
         ((0.5, 0.1, 0.4), 0.5, "Raise distance_ratio (here 2)"),
-        ((0.1, 0.2, 0.7), 0.95, "95 % of the map is behind walls"),
+        ((0.1, 0.2, 0.7), 0.95, "95\u00a0% of the map is behind walls"),
     ],
 )
 def test_advice(served, masked, words):
