@@ -81,6 +81,12 @@ BAKE_EXAMPLES = """examples:
   envmap-render render room.xml --integrator envmap_hybrid --set cache_file=state.exr
 
 """
+INSPECT_EXAMPLES = """examples:
+  envmap-render inspect room.xml                       # room.html, to be opened in a browser
+  envmap-render inspect room.xml --spp 256 -s 1        # as a render of 256 samples, second sensor
+  envmap-render inspect room.xml --set distance_ratio=3.0 --set maps=always
+
+"""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -135,6 +141,27 @@ def build_parser() -> argparse.ArgumentParser:
     _add_scene_options(bake)
     bake.add_argument("-o", "--output", type=Path, required=True)
     bake.set_defaults(command=commands.bake)
+
+    inspect = subparsers.add_parser(
+        "inspect",
+        help="show why a picture is as it is, as an HTML page",
+        description="Show why a picture is as it is: patches and irradiance of the cache and its "
+        "error, clusters, cubes and maps, and where rays end, as one HTML file that needs no "
+        "network. By envmap_hybrid, unless the scene or --integrator names one_level_path. Takes "
+        "pip install '.[inspect]'.",
+        epilog=INSPECT_EXAMPLES + EXIT_CODES,
+    )
+    _add_scene_options(inspect)
+    inspect.add_argument(
+        "-s", "--sensor", type=int, default=0, metavar="INDEX", help="in the scene's order, from 0"
+    )
+    inspect.add_argument("-o", "--output", type=Path, help="default: beside the scene, .html")
+    inspect.add_argument(
+        "--spp", type=int, default=0,
+        help="samples per pixel of the render that it is about, default: the scene's",
+    )  # fmt: skip
+    inspect.add_argument("--seed", type=int, default=0, help="of the sampler")
+    inspect.set_defaults(command=commands.inspect, denoise=False)
 
     check = subparsers.add_parser("doctor", help="say what this machine can render with")
     check.add_argument("--debug", action="store_true", help=argparse.SUPPRESS)

@@ -1,4 +1,4 @@
-"""The commands ``render`` and ``bake``."""
+"""The commands ``render``, ``bake`` and ``inspect``."""
 
 from __future__ import annotations
 
@@ -16,11 +16,13 @@ from rich.table import Table
 
 import envmap_integrator
 from envmap_integrator.cli.output import write_bitmap, write_png
-from envmap_integrator.cli.scene_file import SceneFile
+from envmap_integrator.cli.scene_file import DEFAULT_INTEGRATOR, SceneFile
 from envmap_integrator.cli.timing import compilation_time, measure, record_kernels
 from envmap_integrator.imaging.denoiser import denoise, prepare_for_denoiser, warm_up
 from envmap_integrator.imaging.progressive import Improving
-from envmap_integrator.system.atomic import check_writable
+from envmap_integrator.inspection.page import load_template, page
+from envmap_integrator.inspection.survey import survey
+from envmap_integrator.system.atomic import check_writable, replacing
 from envmap_integrator.system.llvm import ensure_llvm
 
 
@@ -160,6 +162,10 @@ def _denoise(bitmap: mi.Bitmap, scene: mi.Scene, settings: dict[str, object]) ->
     pixels[:, :, :3] = denoise(scene, scene.integrator(), pixels, spp, seed, sensor)
 
 
+#: Integrators that there is something to see of.
+INSPECTED = ("envmap_hybrid", "one_level_path")
+
+
 def bake(args: argparse.Namespace) -> int:
     """Run the integrator's pre-passes alone and save their result."""
     _check_output(args.output)
@@ -177,6 +183,38 @@ def bake(args: argparse.Namespace) -> int:
         compilation = compilation_time()
     state.save(args.output)
     _report(args, seconds, compilation, args.output)
+    return 0
+
+
+def inspect(args: argparse.Namespace) -> int:
+    """Write a page that shows what was prepared for a picture, and what its rays do."""
+    output = args.output or args.scene.with_suffix(".html")
+    _check_output(output, ".html")
+    _require(args.spp >= 0, f"--spp must not be negative, got {args.spp}")
+    template = load_template()  # Fails before the work starts, if it's missing.
+    _configure_machine(args)
+    seconds: dict[str, float] = {}
+    with record_kernels():
+        with measure(seconds, "load"):
+            scene_file = SceneFile(args.scene, dict(args.define))
+            ours = scene_file.integrator.plugin_name() in INSPECTED
+            name = args.integrator or (None if ours else DEFAULT_INTEGRATOR)
+            _require(
+                name in (None, *INSPECTED),
+                f'integrator "{name}" has nothing to inspect: pass --integrator envmap_hybrid',
+            )
+            scene_file.configure_integrator(name, dict(args.set) | {"sampler": "coherent"})
+            scene = scene_file.load(merge_meshes=False)  # Shapes keep their names.
+        sensor = _sensor(scene, args.sensor)
+        settings = _settings(args, scene_file, scene, sensor)
+        with measure(seconds, "survey"):
+            found = survey(scene, sensor, scene.integrator(), settings["spp"], args.seed)
+        with measure(seconds, "page"):
+            text = page(template, found, scene, sensor, str(args.scene), settings)
+            with replacing(output) as file:
+                file.write(text.encode())
+        compilation = compilation_time()
+    _report(args, seconds, compilation, output, settings=settings)
     return 0
 
 
@@ -234,9 +272,10 @@ def _settings(
     }
 
 
-def _check_output(path: Path) -> None:
+def _check_output(path: Path, suffix: str = ".exr") -> None:
     """Fail before the work starts rather than after it."""
-    _require(path.suffix == ".exr", f'output "{path}" must end in .exr (--png adds a PNG)')
+    more = " (--png adds a PNG)" if suffix == ".exr" else ""
+    _require(path.suffix == suffix, f'output "{path}" must end in {suffix}{more}')
     check_writable(path)
 
 

@@ -14,12 +14,13 @@ GUIDE_SPP = 16
 def prepare_for_denoiser(integrator: mi.Integrator) -> bool:
     """Have an integrator give the AOVs that help ``denoise``.
 
-    Returns whether that has switched them on: they are to be taken off the picture afterwards.
+    Returns whether all AOVs are to be taken off the picture afterwards: nobody asked for any.
     """
-    switched_on = getattr(integrator, "indirect_aovs", None) is False
-    if switched_on:
-        integrator.indirect_aovs = True
-    return switched_on
+    if getattr(integrator, "indirect_aovs", None) is not False:
+        return False
+    unasked = not integrator.aov_names()
+    integrator.indirect_aovs = True
+    return unasked
 
 
 def denoise(

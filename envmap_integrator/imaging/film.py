@@ -12,12 +12,13 @@ import mitsuba as mi
 from ..lookup.lookup import Lookup
 from ..system.fingerprint import SensorConstants
 from ..system.interrupt import memory, not_interrupted
-from ..system.jit import give_back
+from ..system.jit import give_back, rgb
 from ..system.progress import stage
 from ..system.recording import Recorder
-from ..transport.camera import CameraSample, camera_radiance
+from ..transport.camera import CameraSample
 from ..transport.gathered import Gathered
 from ..transport.rules import PathRules
+from .aovs import Aov, camera_sample
 from .irradiance_filter import filter_irradiance, pixel_records, tolerance
 from .pixel_filter import PixelFilter
 from .sample_points import SamplePoints, shared_strata
@@ -32,18 +33,19 @@ MIN_LANES, MAX_LANES = 1 << 20, (1 << 32) - 1
 
 @dataclass(frozen=True)
 class Shading:
-    """What finds the light of a sample: all that paths read, and how they go."""
+    """What finds the light of a sample: all that paths read, how they go, and AOVs to find."""
 
     scene: mi.Scene
     lookup: Lookup
     rules: PathRules
+    aovs: tuple[Aov, ...] = ()
 
     def __call__(
         self, sampler: mi.Sampler | SamplePoints, ray: mi.Ray3f, index: mi.UInt32
     ) -> CameraSample:
         """The light that comes along the ray of the sample of an index."""
-        rules = self.rules.of_sample(index)
-        return camera_radiance(self.scene, self.lookup, rules, sampler, ray, mi.Bool(True))
+        rules, active = self.rules.of_sample(index), mi.Bool(True)
+        return camera_sample(self.scene, self.lookup, rules, self.aovs, sampler, ray, active)
 
 
 @dataclass(frozen=True)
@@ -121,13 +123,18 @@ def gathered_sums(
     recorder: Recorder,
     first: int = 0,
 ) -> Sums:
-    """As ``plain_sums``, with what surfaces gather taken apart."""
-    n_guides = Gathered.count()
-    return _accumulate(sensor, sampler, spp, seed, shading, recorder, _apart, n_guides, first)
+    """As ``plain_sums``, with the AOVs of ``shading``, and what surfaces gather taken apart."""
+    n_aovs = sum(len(aov.channels()) for aov in shading.aovs)
+    record, n_further = _directly if n_aovs else recorder, n_aovs + Gathered.count()
+    return _accumulate(sensor, sampler, spp, seed, shading, record, _apart, n_further, first)
 
 
-def put_gathered(sensor: mi.Sensor, sums: Sums, n_shared: int, with_aovs: bool) -> None:
-    """Put ``gathered_sums`` to the film of the sensor and, if asked for, ``INDIRECT_AOVS``.
+def put_gathered(
+    sensor: mi.Sensor, sums: Sums, n_shared: int, names: list[str], with_aovs: bool
+) -> None:
+    """Put ``gathered_sums`` to the film of the sensor, with AOVs of the given ``names``.
+
+    ``INDIRECT_AOVS`` come after them, if asked for.
 
     Pixels share what they gather with ``n_shared`` rays each, unless that is 0. The list is used
     up: these are the largest arrays of a render, and none outlives its use.
@@ -147,7 +154,7 @@ def put_gathered(sensor: mi.Sensor, sums: Sums, n_shared: int, with_aovs: bool) 
         sums[index] = sums[index] + value
     if with_aovs:
         sums += [*rgb(indirect), *aovs]
-    sensor.film().prepare(INDIRECT_AOVS if with_aovs else [])
+    sensor.film().prepare([*names, *(INDIRECT_AOVS if with_aovs else [])])
     _put(sensor, sums)
 
 
@@ -169,7 +176,8 @@ def _plain(film, found, weight):
 
 def _apart(film, found, weight):
     apart = found.radiance - found.gathered.radiance
-    return [*_shown(film, apart, found.valid, weight), *found.gathered.channels()]
+    aovs = (weight * value for value in found.aovs)
+    return [*_shown(film, apart, found.valid, weight), *aovs, *found.gathered.channels()]
 
 
 def _directly(key, function, *inputs):
@@ -296,8 +304,3 @@ def _shown(film: mi.Film, radiance, valid, weight) -> list[mi.Float]:
     wanted = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
     alpha = [dr.select(valid, weight, 0)] if wanted else []
     return [*rgb(radiance), *alpha, weight]
-
-
-def rgb(radiance: mi.Spectrum) -> tuple[mi.Float, mi.Float, mi.Float]:
-    """What films hold of a colour."""
-    return tuple(radiance) if len(radiance) == 3 else (radiance[0],) * 3

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 import drjit as dr
 import mitsuba as mi
 
+from ..imaging.aovs import Aov, camera_sample, parse_aovs
 from ..imaging.film import (
     INDIRECT_AOVS,
     Shading,
@@ -19,7 +20,6 @@ from ..imaging.film import (
     plain_sums,
     put_gathered,
     put_plain,
-    rgb,
 )
 from ..imaging.progressive import Improving, improve
 from ..lookup.far_field import FarField
@@ -30,9 +30,10 @@ from ..preparation.pipeline import prepare
 from ..preparation.scene_state import SceneState, SceneStates
 from ..system.checks import check_not_frozen, check_scene, check_variant
 from ..system.interrupt import interruptible
+from ..system.jit import rgb
 from ..system.parameters import Parameters
 from ..system.recording import Recorder
-from ..transport.camera import CameraSample, camera_radiance
+from ..transport.camera import CameraSample
 from ..transport.rules import PathRules, Residual
 
 #: Our own sample points, Mitsuba's samplers, and that of the scene.
@@ -101,9 +102,13 @@ class CachedIntegrator(mi.SamplingIntegrator):
         """Names of the channels that the film holds besides those of every film."""
         return []
 
-    def aovs(self, found: CameraSample) -> list[mi.Float]:
+    def aov_values(self, found: CameraSample) -> list[mi.Float]:
         """Values of ``aov_names``."""
         return []
+
+    def sample_aovs(self) -> tuple[Aov, ...]:
+        """What there is to be in ``CameraSample.aovs``."""
+        return ()
 
     def sums(
         self,
@@ -116,7 +121,8 @@ class CachedIntegrator(mi.SamplingIntegrator):
     ) -> Sums:
         """Sums over samples of each pixel, as ``imaging.film`` has them."""
         n_aovs, recorder = len(self.aov_names()), self._recorder
-        return plain_sums(sensor, sampler, spp, seed, shading, recorder, n_aovs, self.aovs, first)
+        values = self.aov_values
+        return plain_sums(sensor, sampler, spp, seed, shading, recorder, n_aovs, values, first)
 
     def put(self, sensor: mi.Sensor, sums: Sums, spp: int) -> None:
         """Put sums over ``spp`` samples to the film of a sensor; the list is used up."""
@@ -232,7 +238,8 @@ class CachedIntegrator(mi.SamplingIntegrator):
         film = sensor.film()
         with interruptible(), dr.suspend_grad():
             sampler, spp = self._pixel_sampler(sensor, spp)
-            shading = Shading(scene, self._lookup(scene, now, baked, spp), self.rules(seed))
+            lookup = self._lookup(scene, now, baked, spp)
+            shading = Shading(scene, lookup, self.rules(seed), self.sample_aovs())
             self.put(sensor, self.sums(sensor, sampler, spp, seed, shading), spp)
             picture = film.develop() if develop else mi.TensorXf()
             if evaluate:
@@ -269,7 +276,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
 
         def send(stream, index):
             seed_ = 2 * seed + stream & 0xFFFFFFFF
-            shading = Shading(scene, lookup, self.rules(seed_))
+            shading = Shading(scene, lookup, self.rules(seed_), self.sample_aovs())
             return self.sums(sensor, None, spp, seed_, shading, first=index * spp)
 
         def develop(sums, n_samples):
@@ -347,10 +354,10 @@ class CachedIntegrator(mi.SamplingIntegrator):
         self._passes += 1
         rules = self.rules(self._passes)
         ray, active = mi.Ray3f(ray), mi.Bool(active)
-        found = camera_radiance(scene, lookup, rules, sampler, ray, active)
+        found = camera_sample(scene, lookup, rules, self.sample_aovs(), sampler, ray, active)
         if dr.grad_enabled(found.radiance):
             self._refuse_gradients()
-        return found.radiance, found.valid, self.aovs(found)
+        return found.radiance, found.valid, self.aov_values(found)
 
 
 class GatheringIntegrator(CachedIntegrator):
@@ -363,6 +370,8 @@ class GatheringIntegrator(CachedIntegrator):
         self.residual_probability = parameters.number("residual_probability", 0.0, 0.0, 1.0)
         self.irradiance_filter = parameters.flag("irradiance_filter", True)
         self.indirect_aovs = parameters.flag("indirect_aovs", False)
+        self.aovs = parameters.text("aovs")
+        parse_aovs(self.aovs, self.owner)  # Complains at once.
         self.clamp_indirect = parameters.number("clamp_indirect", 0.0, 0.0)
 
     def rules(self, seed: int) -> PathRules:
@@ -390,20 +399,27 @@ class GatheringIntegrator(CachedIntegrator):
         if not (self._shares() or self.indirect_aovs):
             return super().put(sensor, sums, spp)
         n_shared = spp * self.secondary_samples if self._shares() else 0
-        put_gathered(sensor, sums, n_shared, self.indirect_aovs)
+        put_gathered(sensor, sums, n_shared, self._own_names(), self.indirect_aovs)
 
     def _shares(self) -> bool:
         """Do pixels share what they gather?"""
         return self.irradiance_filter and self.residual_probability == 0
 
-    def aov_names(self) -> list[str]:
-        return list(INDIRECT_AOVS) if self.indirect_aovs else []
+    def sample_aovs(self) -> tuple[Aov, ...]:
+        return parse_aovs(self.aovs, self.owner)
 
-    def aovs(self, found: CameraSample) -> list[mi.Float]:
+    def aov_names(self) -> list[str]:
+        return [*self._own_names(), *(INDIRECT_AOVS if self.indirect_aovs else [])]
+
+    def _own_names(self) -> list[str]:
+        return [channel for aov in self.sample_aovs() for channel in aov.channels()]
+
+    def aov_values(self, found: CameraSample) -> list[mi.Float]:
         if not self.indirect_aovs:
-            return []
+            return found.aovs
         gathered = found.gathered
-        return [c for x in (gathered.radiance, gathered.radiance, gathered.albedo) for c in rgb(x)]
+        indirect = (gathered.radiance, gathered.radiance, gathered.albedo)
+        return [*found.aovs, *(c for x in indirect for c in rgb(x))]
 
 
 def _serves(state: BakedState, scene: mi.Scene, now: SceneState, view: mi.Sensor | None) -> bool:

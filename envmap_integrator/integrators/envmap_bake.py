@@ -66,5 +66,5 @@ class EnvmapBake(CachedIntegrator):
     def aov_names(self) -> list[str]:
         return ["distance"]
 
-    def aovs(self, found: CameraSample) -> list[mi.Float]:
+    def aov_values(self, found: CameraSample) -> list[mi.Float]:
         return [dr.select(found.valid, found.distance, 0)]

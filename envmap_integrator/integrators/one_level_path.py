@@ -42,6 +42,13 @@ class OneLevelPath(GatheringIntegrator):
        - Also give the indirect light that diffuse surfaces gather, as AOVs: ``indirect`` as in the
          picture, ``gathered`` before pixels share it, and ``albedo``, what it's in proportion to.
          The denoiser takes it apart from direct light. (Default: false)
+     * - aovs
+       - |string|
+       - AOVs as in Mitsuba's :monosp:`aov`, such as ``p:patch, s:served``: ``patch`` and
+         ``cluster``, a colour for each; ``irradiance``, ``indirect_irradiance``,
+         ``irradiance_error``: what the cache holds, and its standard error [W/m²]; ``served``: part
+         of the secondary rays that were traced on (R), ended in the cache (G) or in a map (B).
+         (Default: none)
      * - clamp_indirect
        - |float|
        - Largest radiance [W/m²/sr] that a secondary ray may bring: cuts fireflies, and the light of

@@ -18,12 +18,14 @@ class Cluster:
     centre       [3] of the box around the surfaces, world space
     radius       largest distance of the surfaces from the centre along an axis, world units
     half_width   of the cube around the centre, world units
+    benefit      part of the variance of what the sensors see that its map takes off, as predicted
     """
 
     name: str
     centre: np.ndarray
     radius: float
     half_width: float
+    benefit: float = 0.0
 
 
 #: Texels along the edge of a face at most.
@@ -80,6 +82,7 @@ def to_parts(cube_map: CubeMap, prefix: str = "") -> tuple[Parts, dict]:
         "centre": cluster.centre.tolist(),
         "radius": cluster.radius,
         "half_width": cluster.half_width,
+        "benefit": cluster.benefit,
         "resolution": cube_map.resolution,
     }
     return parts, metadata
@@ -106,7 +109,6 @@ def from_stored(stored: Stored, prefix: str = "") -> CubeMap:
             raise stored.refusal(f'its "{prefix}level{number}" has another size than 6 * {size}²')
         levels.append(np.stack(np.split(np.stack(channels, axis=-1), 6, axis=1)))
     centre = np.array(stored.point("centre"))
-    cluster = Cluster(
-        stored.text("name"), centre, stored.number("radius"), stored.number("half_width")
-    )
+    radius, half_width = stored.number("radius"), stored.number("half_width")
+    cluster = Cluster(stored.text("name"), centre, radius, half_width, stored.number("benefit"))
     return CubeMap(cluster, levels)

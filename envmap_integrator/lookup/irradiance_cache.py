@@ -18,10 +18,13 @@ class IrradianceCache:
     patches   the coarse mesh
     table     [2 * P * C]  W/m²: row 2p total, row 2p + 1 indirect irradiance of patch p, by C
                            colour channels
+    error     [P]          W/m²: standard error of total irradiance, mean of the colour channels;
+                           None while the cache is being made
     """
 
     patches: Patches
     table: mi.Float
+    error: mi.Float | None = None
 
     def irradiance(self, row: mi.UInt32, active: mi.Bool | bool = True) -> mi.Spectrum:
         """Irradiance [W/m²] in a row of the table."""

@@ -142,6 +142,7 @@ def save(path: str | os.PathLike, prepared: BakedState) -> None:
         "patches": {"fingerprint": _image(patches.cells.numpy())},
         "levels": {"entry": _image(patches.levels.numpy())},
         "irradiance": {"Y": _image(prepared.cache.table.numpy())},
+        "irradiance_error": {"Y": _image(prepared.cache.error.numpy())},
         "sources": {"alias": _image(prepared.emitter_table.numpy())},
         "emitter_rows": {"row": _image(prepared.emitter_rows.numpy())},
     }
@@ -207,6 +208,7 @@ def _prepared(stored: Stored, key: StateKey, n_emitters: int) -> BakedState:
         use_objects=stored.flag("use_objects"),
     )
     table = values("irradiance", "Y", np.float32, 2 * n_patches * n_channels)
+    error = values("irradiance_error", "Y", np.float32, n_patches)
 
     # What kernels look up has to be there: they don't check.
     n_sources = stored.integer("sources", 4 * n_emitters)
@@ -230,7 +232,7 @@ def _prepared(stored: Stored, key: StateKey, n_emitters: int) -> BakedState:
             raise stored.refusal(f"its clusters are more than its {len(maps)} maps")
     return BakedState(
         key,
-        IrradianceCache(patches, upload(mi.Float, table)),
+        IrradianceCache(patches, upload(mi.Float, table), upload(mi.Float, error)),
         upload(mi.Float, sources),
         upload(mi.UInt32, rows),
         tuple(stored.texts("views")),

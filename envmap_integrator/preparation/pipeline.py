@@ -22,7 +22,13 @@ from .coarse_mesh.spaces import find_spaces, separate
 from .coarse_mesh.surface_points import scatter_points
 from .coarse_mesh.views import usual_service, view_name
 from .maps.bake import bake_maps
-from .maps.clusters import cluster_of_cell, find_clusters, listed_clusters, worthwhile
+from .maps.clusters import (
+    benefit,
+    cluster_of_cell,
+    find_clusters,
+    listed_clusters,
+    worthwhile,
+)
 from .radiosity.direct_light import choose_emitters, survey_direct_light
 from .radiosity.evenness import sort_out_uneven
 from .radiosity.irradiance import solve_irradiance
@@ -114,17 +120,23 @@ def prepare(
 def _clusters(scene, mesh, solution, settings):
     """Those that are listed, or those found whose maps would pay: see ``find_clusters``."""
     points, space = mesh.points, mesh.space_of_point
-    if settings.requests:
-        return listed_clusters(points, space, scene, settings.requests, settings.distance_ratio)
     share = np.where(mesh.patch_of_point >= 0, solution.escaped_share[mesh.patch_of_point], 0)
-    none = [], np.full(len(points), -1)
+    if settings.requests:
+        found = listed_clusters(points, space, scene, settings.requests, settings.distance_ratio)
     # Clusters are only looked for if they would pay at least if everything belonged to one.
-    if not (settings.map_always or worthwhile(points, share)):
-        return none
-    found = find_clusters(points, space, settings.distance_ratio)
-    if not (settings.map_always or worthwhile(points, share, found[1] >= 0)):
-        return none
-    return found
+    elif settings.map_always or worthwhile(benefit(points, share)):
+        found = find_clusters(points, space, settings.distance_ratio)
+    else:
+        found = [], np.full(len(points), -1)
+    clusters, cluster_of_point = found
+    clusters = [
+        replace(cluster, benefit=benefit(points, share, cluster_of_point == i))
+        for i, cluster in enumerate(clusters)
+    ]
+    pays = worthwhile(sum(cluster.benefit for cluster in clusters))
+    if not (settings.requests or settings.map_always or pays):
+        return [], np.full(len(points), -1)
+    return clusters, cluster_of_point
 
 
 def _baked(scene, lookup, clusters, members, settings, owner) -> tuple[CubeMap, ...]:

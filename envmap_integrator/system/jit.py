@@ -49,6 +49,11 @@ def mean_channel(colour: mi.Spectrum) -> mi.Float:
     return dr.sum(colour) / len(colour)
 
 
+def rgb(radiance: mi.Spectrum) -> tuple[mi.Float, mi.Float, mi.Float]:
+    """What films hold of a colour."""
+    return tuple(radiance) if len(radiance) == 3 else (radiance[0],) * 3
+
+
 def mix(h: mi.UInt32) -> mi.UInt32:
     """Finaliser of MurmurHash3: every input bit affects every output bit."""
     h = (h ^ (h >> 16)) * 0x85EBCA6B

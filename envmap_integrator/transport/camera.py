@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -31,12 +31,16 @@ class CameraSample:
     distance   [m]  to the first hit, infinite if there is none
     valid           whether there is one (alpha)
     gathered        the part of the radiance that pixels may share, None if there is none at all
+    vertex          the first surface that isn't a mirror or glass, None without secondary rays
+    aovs            what else the film is to hold of it
     """
 
     radiance: mi.Spectrum
     distance: mi.Float
     valid: mi.Bool
     gathered: Gathered | None = None
+    vertex: Vertex | None = None
+    aovs: list[mi.Float] = field(default_factory=list)
 
     def scaled(self, factor: mi.Spectrum | mi.Float) -> CameraSample:
         """The same, seen with a throughput or a weight of the sensor [1]."""
@@ -140,7 +144,7 @@ def split(
         wide /= rules.secondary_samples
         nearness /= rules.secondary_samples
     gathered = gathering(scene, si, vertex.bsdf, wide, nearness, vertex.smooth)
-    seen = CameraSample(radiance + arriving, distance, valid, gathered).scaled(throughput)
+    seen = CameraSample(radiance + arriving, distance, valid, gathered, vertex).scaled(throughput)
     return replace(seen, radiance=seen.radiance + on_mirrors)
 
 
@@ -214,11 +218,27 @@ def secondary(
     Returns the radiance [W/m²/sr] that it brings, the part of it by wide lobes, the inverse
     distance [1/m] to where they were traced, and whether anything was solid.
     """
+    start, scattered = leave(lookup, sampler, vertex, u, active)
+    wide = scattered.wide
+    going = active & (dr.max(scattered.weight) > 0)
+    end = follow(scene, lookup, rules, sampler, start, going)
+    arriving = scattered.weight * end.radiance
+    if rules.clamp is not None:
+        largest = dr.max(dr.abs(arriving))
+        arriving *= dr.select(largest > rules.clamp, rules.clamp / largest, 1)
+    nearness = dr.rcp(dr.minimum(end.distance, start.ray.maxt))
+    return arriving, dr.select(wide, arriving, 0), dr.select(wide, nearness, 0), end.valid
+
+
+def leave(
+    lookup: Lookup, sampler: mi.Sampler, vertex: Vertex, u: mi.Float, active: mi.Bool
+) -> tuple[PathStart, Scattered]:
+    """Start of a secondary ray from a camera hit, and the direction that the material sampled."""
     si = vertex.si
     scattered = Scattered.of(
         si, *vertex.bsdf.sample(mi.BSDFContext(), si, u, sampler.next_2d(), active)
     )
-    bs, wide = scattered.bs, scattered.wide
+    bs = scattered.bs
     start = PathStart(
         ray=si.spawn_ray(si.to_world(bs.wo)),
         depth=dr.select(scattered.specular, mi.UInt32(0), mi.UInt32(1)),
@@ -231,13 +251,6 @@ def secondary(
     if vertex.cube is not None:
         start.cluster = vertex.cube.cluster
         start.bounded, start.ray.maxt, start.reach = lookup.far_field.bound(
-            vertex.cube, start.ray, wide, sampler.next_1d(), active
+            vertex.cube, start.ray, scattered.wide, sampler.next_1d(), active
         )
-    going = active & (dr.max(scattered.weight) > 0)
-    end = follow(scene, lookup, rules, sampler, start, going)
-    arriving = scattered.weight * end.radiance
-    if rules.clamp is not None:
-        largest = dr.max(dr.abs(arriving))
-        arriving *= dr.select(largest > rules.clamp, rules.clamp / largest, 1)
-    nearness = dr.rcp(dr.minimum(end.distance, start.ray.maxt))
-    return arriving, dr.select(wide, arriving, 0), dr.select(wide, nearness, 0), end.valid
+    return start, scattered

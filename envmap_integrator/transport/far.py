@@ -22,6 +22,8 @@ class Met:
     counts          ... and whether its light counts
     radiance        [W/m²/sr]  from the map, times the path's throughput
     boost           [1]  factor on all that the path brings from there on
+    mapped          whether the map was read,
+    retraced        ... and whether the ray was traced on from the cube
     """
 
     si: mi.SurfaceInteraction3f
@@ -29,11 +31,14 @@ class Met:
     counts: mi.Bool
     radiance: mi.Spectrum
     boost: mi.Float
+    mapped: mi.Bool
+    retraced: mi.Bool
 
 
 def near_alone(path: Path, si: mi.SurfaceInteraction3f) -> Met:
     """Without maps."""
-    return Met(si, si, path.active & (si.t <= path.reach), mi.Spectrum(0), mi.Float(1))
+    counts, no = path.active & (si.t <= path.reach), mi.Bool(False)
+    return Met(si, si, counts, mi.Spectrum(0), mi.Float(1), no, no)
 
 
 def look_up_far(
@@ -85,4 +90,4 @@ def look_up_far(
         counts |= visible
     boost = dr.select(residual, dr.rcp(path.q), 1)
     path.q[residual] = 1
-    return Met(si, emitter_si, counts, radiance, boost)
+    return Met(si, emitter_si, counts, radiance, boost, read, traced_on)

@@ -121,7 +121,7 @@ def test_quiet_or_json(scene, capsys):
     assert "not allowed with" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", [(), ("render",), ("bake",)])
+@pytest.mark.parametrize("command", [(), ("render",), ("bake",), ("inspect",)])
 def test_help_teaches(capsys, command):
     with pytest.raises(SystemExit, match="0"):
         run(*command, "--help")
@@ -211,6 +211,9 @@ def test_indirect_light_is_denoised_apart(scene, tmp_path):
     assert run("render", scene, "-o", output, *options) == 0
     assert run("render", scene, "-o", kept, *options, "--set", "indirect_aovs=true") == 0
     assert pixels(output).shape[2] == pixels(kept).shape[2] - 9
+    asked = tmp_path / "asked.exr"
+    assert run("render", scene, "-o", asked, *options, "--set", "aovs=s:served") == 0
+    assert pixels(asked).shape[2] == pixels(kept).shape[2] + 3
     scene_file = SceneFile(scene)
     scene_file.configure_reconstruction_filters("box")
     loaded = scene_file.load()

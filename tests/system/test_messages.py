@@ -22,7 +22,9 @@ from compare.hard_cases import empty_mesh
 from envmap_integrator.cli import commands
 from envmap_integrator.cli.scene_file import SceneFile, parse_assignment
 from envmap_integrator.imaging import film
+from envmap_integrator.imaging.aovs import parse_aovs
 from envmap_integrator.imaging.denoiser import warm_up
+from envmap_integrator.inspection.page import load_template
 from envmap_integrator.preparation.maps.clusters import ClusterRequest, listed_clusters
 from envmap_integrator.system import memory, storage
 from envmap_integrator.system.atomic import check_writable, replacing
@@ -111,6 +113,10 @@ def emitter(**parameters: object) -> Callable:
         {"type": "mipmap_cube", "id": "sky"}
         | {key: str(v(s)) if key == "filename" else v for key, v in parameters.items()}
     )
+
+
+def aovs(text: str) -> Callable:
+    return lambda _: parse_aovs(text, "ours")
 
 
 def frozen(_: Surroundings) -> None:
@@ -247,6 +253,11 @@ def xml(text: str) -> Callable:
     return action
 
 
+def without_jinja(s: Surroundings) -> None:
+    s.patch.setitem(sys.modules, "jinja2", None)
+    load_template()
+
+
 def without_denoiser(s: Surroundings) -> None:
     s.patch.setitem(sys.modules, "mitsuba_oidn", None)
     warm_up(4, 4)
@@ -307,6 +318,8 @@ CASES = {
     "choice": Case(parameter("choice", "c", "a", ("a", "b")), '"x"', "'c'", '"a" or "b"'),
     "text": Case(parameter("text", 3), '"x"', "3", "must be a string"),
     "range": Case(parameter("integer", 9, 1, 1, 8), '"x"', "9", "at least 1 and at most 8"),
+    "AOV": Case(aovs("p:patch, depth"), "ours", '"depth"', "must list name:type"),
+    "AOV twice": Case(aovs("a:patch, a:served"), "ours", 'two of the name "a"', "rename one"),
     "nested": Case(
         lambda _: integrator("envmap_hybrid", cube={"type": "point"}),
         "envmap_hybrid", 'PointLight "cube"', "must be one envmap_bake or a mipmap_cube",
@@ -442,6 +455,15 @@ CASES = {
     "mode": Case(shell(commands.render, mode="gpu"), "variant", '"gpu"', "choose from"),
     "sensor": Case(shell(commands.render, sensor=1), "--sensor", "1", "the scene has 1 sensor(s)"),
     "output": Case(shell(commands.bake, output="b.png"), "output", "b.png", "must end in .exr"),
+    "page": Case(shell(commands.inspect, output="b.exr"), "output", "b.exr", "must end in .html"),
+    "spp of a page": Case(
+        shell(commands.inspect, output="b.html", spp=-1), "--spp", "-1", "must not be negative"
+    ),
+    "nothing to inspect": Case(
+        shell(commands.inspect, output="b.html", integrator="path"), "integrator", '"path"',
+        "pass --integrator envmap_hybrid",
+    ),
+    "no templates": Case(without_jinja, "jinja2", "is missing", "pip install jinja2"),
     "no colour": Case(
         shell(commands.render, denoise=True), "--denoise", "1 channel(s)", "to rgb or rgba"
     ),

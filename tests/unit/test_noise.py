@@ -76,6 +76,22 @@ def test_caches_scatter_as_they_state(scene):
     assert scatter / 2 < stated.mean() < 2 * scatter
 
 
+def test_irradiance_scatters_as_each_patch_states():
+    """Or less: rays are stratified better than pairs of them tell."""
+    scene = load(room())
+    coarse = coarse_mesh(scene, BUDGET, points_per_patch=32)
+    caches = [
+        solve_irradiance(scene, coarse.lookup(), coarse, SAMPLES, seed=1 << 20 | seed << 12).cache
+        for seed in range(24)
+    ]
+    scatter = np.std([cache.mean_channel()[::2] for cache in caches], axis=0, ddof=1)
+    stated = np.sqrt(np.mean([np.square(cache.error.numpy()) for cache in caches], axis=0))
+    used = scatter > 0
+    assert used.sum() > BUDGET / 4 and not stated[~used].any()
+    assert 0.5 < np.median(scatter[used] / stated[used]) < 1.1
+    assert np.corrcoef(np.log(scatter[used]), np.log(stated[used]))[0, 1] > 0.7
+
+
 def test_more_rays_lower_the_error_without_a_bias():
     few, stated_of_few = solutions(behind_a_wall())
     many, stated_of_many = solutions(behind_a_wall(), more_rays=1 << 18)
@@ -96,6 +112,7 @@ def noise(relative_error: float) -> Noise:
         coarseness=Coarseness(bias=0.0, doubt=0.0, steep=np.zeros(1, dtype=bool), steep_bias=0.0),
         scatter=np.array([1.0, 2.0, 3.0, 0.0]) * relative_error,
         stake=np.array([1.0, 1.0, 1.0, 4.0]),
+        of_irradiance=np.zeros(4),
         count=np.ones(4, dtype=np.int64),
         escaped_share=np.zeros(4),
     )

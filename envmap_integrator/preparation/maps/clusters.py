@@ -146,19 +146,27 @@ def find_clusters(
     return clusters, cluster_of_point
 
 
-def worthwhile(
+def benefit(
     points: SurfacePoints, escaped_share: np.ndarray, mapped: np.ndarray | bool = True
-) -> bool:
-    """Do maps for the surface points that are ``mapped`` [N] spare more than they cost?
+) -> float:
+    """Part of the variance of what the sensors see that maps take off at most.
 
-    Shorter rays don't: in a hierarchy of bounding volumes they take about as long as longer ones.
-    What a map has ahead of tracing is that it has averaged light that comes through mirrors and
-    glass, which single paths seldom find. ``escaped_share`` [N] says for every surface point what
-    part of the variance that is at most. Maps take it off where the sensors see a cluster, and
-    their cost is added everywhere.
+    Maps are for the surface points that are ``mapped`` [N]. That rays are shorter spares nothing:
+    in a hierarchy of bounding volumes they take about as long as longer ones. What a map has ahead
+    of tracing is that it has averaged light that comes through mirrors and glass, which single
+    paths seldom find. ``escaped_share`` [N] says for every surface point what part of the variance
+    that is at most.
     """
     seen = points.seen > 0
-    return escaped_share[seen & mapped].sum() > LOOK_UP_COST * seen.sum()
+    return float(escaped_share[seen & mapped].sum() / max(seen.sum(), 1))
+
+
+def worthwhile(benefit: float) -> bool:
+    """Do maps spare more than they cost?
+
+    They take variance off where the sensors see a cluster, and their cost is added everywhere.
+    """
+    return benefit > LOOK_UP_COST
 
 
 def cluster_of_cell(n_clusters: int, cluster_of_point: np.ndarray, mesh: CoarseMesh) -> np.ndarray:

@@ -6,7 +6,7 @@ tracing another ray. Where the picture hangs on few rays that found light, more 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -77,7 +77,7 @@ def solve_irradiance(
     if n_used == 0:  # Nothing but mirrors and glass.
         table = dr.zeros(mi.Float, 2 * n_patches * n_channels)
         no_cell = np.zeros(dr.width(lookup.patches.levels), dtype=bool)
-        cache = IrradianceCache(lookup.patches, table)
+        cache = IrradianceCache(lookup.patches, table, dr.zeros(mi.Float, n_patches))
         return Solution(cache, None, np.zeros(n_patches), no_cell)
 
     def send(rank, seed):
@@ -98,8 +98,10 @@ def solve_irradiance(
         if not wanted.any():
             break
         rank = np.repeat(np.arange(n_used), wanted)
-    escaped_share = np.zeros(n_patches)
+    escaped_share, error = np.zeros(n_patches), np.zeros(n_patches)
     escaped_share[members.patches] = noise.escaped_share
+    error[members.patches] = noise.of_irradiance
+    cache = replace(cache, error=upload(mi.Float, error))
     n_rays = dr.width(rays.row)
     del rays
     give_back(FLOATS_PER_RAY * n_rays)

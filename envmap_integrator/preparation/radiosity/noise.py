@@ -40,6 +40,8 @@ class Noise:
     scatter          [K]  what a single ray of each patch adds to that error, root mean square over
                           the patch's surroundings
     stake            [K]  share of the picture's brightness that passes through the patch, likewise
+    of_irradiance    [K]  W/m²: standard error of each patch's irradiance, by the chance of its rays
+                          alone, not of what they find on other patches
     count            [K]  blocks of rays so far
     escaped_share    [K]  see ``Solution``
     """
@@ -48,6 +50,7 @@ class Noise:
     coarseness: Coarseness
     scatter: np.ndarray
     stake: np.ndarray
+    of_irradiance: np.ndarray
     count: np.ndarray
     escaped_share: np.ndarray
 
@@ -109,8 +112,10 @@ def cache_noise(
         dr.eval(others)
         sources, others = (x - dr.gather(mi.Float, x, lane) for x in (sources, others))
     products = sources * sources, others * others, 2 * sources * others
-    moments = (0.5 / samples**2 * _block_sum(x, samples)[:, None] for x in products)
-    within = sum(a * moment for a, moment in zip((t * t, i * i, t * i), moments, strict=True))
+    moments = [0.5 / samples**2 * _block_sum(x, samples) for x in products]
+    within = sum(
+        a * moment[:, None] for a, moment in zip((t * t, i * i, t * i), moments, strict=True)
+    )
 
     # ---- By patch: the scatter of its blocks, if there are several, as rays of one are stratified
     count = blocks.count
@@ -136,6 +141,7 @@ def cache_noise(
         coarseness=coarse,
         scatter=np.sqrt(around(variance * count * samples)),
         stake=around(indirect.sum(axis=1) * irradiance),
+        of_irradiance=np.sqrt(np.maximum(by_patch @ sum(moments), 0) / count),
         count=count,
         escaped_share=escaped / np.maximum(escaped + patched, 1e-30),
     )

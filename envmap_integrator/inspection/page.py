@@ -1,0 +1,142 @@
+"""The page: one HTML file that holds its pictures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from ..imaging.aovs import false_colour
+from ..preparation.maps.clusters import LOOK_UP_COST
+from . import advice
+from .pictures import eight_bits, embedded, on_ramp, ramp_css, shrunk, tone_mapped, white_of
+from .survey import ClusterView, Survey, View
+from .unfolded import Faces, unfolded
+from .wires import Wires, wires
+
+#: Ends of the scale of relative errors.
+LEAST_ERROR, MOST_ERROR = 0.01, 1.0
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A cluster on the page.
+
+    view             what is known of it
+    colour           CSS colour
+    wires            its cube in the picture
+    radiance, distance  URIs of its unfolded map
+    near, far        ends of the scale of distances
+    shapes           its largest shapes, and how many there are
+    remarks, xml     see ``advice``
+    """
+
+    view: ClusterView
+    colour: str
+    wires: Wires
+    radiance: str
+    distance: str
+    near: float
+    far: float
+    shapes: list[tuple[str, float]]
+    n_shapes: int
+    remarks: list[str]
+    xml: str
+
+
+def load_template() -> Any:
+    """The page's template; raises ``ImportError`` if the optional package jinja2 is missing."""
+    try:
+        import jinja2
+    except ImportError:
+        raise ImportError("jinja2, which writes the page, is missing: pip install jinja2") from None
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["percent"] = advice.percent
+    return environment.get_template("page.html.j2")
+
+
+def page(
+    template: Any,
+    survey: Survey,
+    scene: mi.Scene,
+    sensor: mi.Sensor,
+    title: str,
+    settings: dict[str, object],
+) -> str:
+    """The page of a survey, by ``load_template()``; ``settings`` are shown as they are."""
+    view = survey.view
+    aovs = {name: shrunk(picture) for name, picture in view.aovs.items()}
+    picture = shrunk(survey.picture)
+    irradiance = aovs["irradiance"]
+    white, light = white_of(picture), white_of(irradiance)
+    mean = irradiance.mean(axis=2)
+    lit = mean > 0
+    error = aovs["irradiance_error"][..., 0] / np.where(lit, mean, 1)
+    height, width = survey.picture.shape[:2]
+    with_maps = survey.mapped or view
+    return template.render(
+        title=title,
+        survey=survey,
+        in_short=advice.in_short(survey),
+        state=view.state,
+        picture=embedded(tone_mapped(picture, white)),
+        patch=embedded(eight_bits(aovs["patch"])),
+        irradiance=embedded(tone_mapped(irradiance, light)),
+        indirect=embedded(tone_mapped(aovs["indirect_irradiance"], light)),
+        light=light,
+        error=embedded(np.where(lit[..., None], on_ramp(error, LEAST_ERROR, MOST_ERROR), 0)),
+        usual_error=float(np.median(error[lit])) if lit.any() else 0.0,
+        unknown=float((view.aovs["patch"].max(axis=2) == 0).mean()),
+        served=embedded(eight_bits(aovs["served"])),
+        shares=view.aovs["served"].mean(axis=(0, 1)).tolist(),
+        ramp=ramp_css(),
+        width=width,
+        height=height,
+        objects=embedded(_objects(picture, white, with_maps)),
+        served_by_maps=embedded(eight_bits(shrunk(with_maps.aovs["served"]))),
+        clusters=_clusters(with_maps, scene, sensor),
+        faces=Faces.of(sensor).names(),
+        look_up_cost=LOOK_UP_COST,
+        settings=settings,
+    )
+
+
+def _objects(picture: np.ndarray, white: float, view: View) -> np.ndarray:
+    """The picture in grey, with the clusters' colours on their objects."""
+    grey = tone_mapped(picture.mean(axis=2, keepdims=True), white) / 255
+    colour = shrunk(view.aovs["cluster"])
+    there = colour.max(axis=2, keepdims=True) > 0
+    return eight_bits(np.where(there, 0.25 * grey + 0.75 * colour, 0.5 * grey + 0.15))
+
+
+def _clusters(view: View, scene: mi.Scene, sensor: mi.Sensor) -> list[Shown]:
+    faces = Faces.of(sensor)
+    shown = []
+    for index, (cluster, cube_map) in enumerate(zip(view.clusters, view.state.maps, strict=True)):
+        radiance, distance, near, far = unfolded(cube_map, faces)
+        red, green, blue = (round(255 * float(c[0])) for c in false_colour(mi.UInt32(index)))
+        shapes = [(name or "(no id)", share) for name, share in cluster.shapes.items()]
+        shown.append(
+            Shown(
+                view=cluster,
+                colour=f"rgb({red}, {green}, {blue})",
+                wires=wires(scene, sensor, cluster.cluster),
+                radiance=embedded(radiance),
+                distance=embedded(distance),
+                near=near,
+                far=far,
+                shapes=shapes[: advice.MOST_SHAPES],
+                n_shapes=len(shapes),
+                remarks=advice.about_cluster(cluster),
+                xml=advice.as_xml(cluster),
+            )
+        )
+    return shown

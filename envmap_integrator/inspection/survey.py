@@ -1,0 +1,199 @@
+"""What a page shows: the picture at few samples, and what was prepared for it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from itertools import groupby, islice
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..imaging.aovs import TYPES
+from ..imaging.film import n_pixels_of
+from ..lookup.cube_map import Cluster
+from ..lookup.ids import ObjectIds
+from ..lookup.patches import DROPPED, MARK_BITS, UNEVEN
+from ..preparation.baked_state import BakedState
+from ..system.scene_order import ordered_shapes
+
+#: Samples per pixel of the picture, in two passes, and of the AOVs.
+PICTURE_SPP, AOV_SPP = 16, 4
+
+
+@dataclass(frozen=True)
+class ClusterView:
+    """A cluster as a sensor sees it.
+
+    cluster   the cluster
+    masked    part of its map's texels that no ray of it was seen to reach
+    shapes    part of the picture by the ids of its shapes, largest first
+    seen      part of the picture that shows it
+    served    parts of its secondary rays that were traced on, ended in the cache, and in its map
+    """
+
+    cluster: Cluster
+    masked: float
+    shapes: dict[str, float]
+    seen: float
+    served: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class View:
+    """A prepared state as a sensor sees it.
+
+    state      what was prepared
+    aovs       pictures [H, W, 1 or 3] by the types of AOVs
+    clusters   those that have a map
+    """
+
+    state: BakedState
+    aovs: dict[str, np.ndarray]
+    clusters: list[ClusterView]
+
+
+@dataclass(frozen=True)
+class Survey:
+    """All that a page shows.
+
+    picture, spp  [H, W, 3] linear, and its samples per pixel
+    noise         relMSE that is left in it by noise
+    timed         samples per pixel of its last pass, and the seconds that it took
+    view          what was prepared for the render that is asked for
+    mapped        the same if maps were made in any case, None if that is so already
+    patches       numbers of patches: in use, of these for indirect light alone, and left out
+    patch_samples gather rays of each at least, None if they were sent long ago
+    warnings      what Mitsuba has logged
+    """
+
+    picture: np.ndarray
+    spp: int
+    noise: float
+    timed: tuple[int, float]
+    view: View
+    mapped: View | None
+    patches: tuple[int, int, int]
+    patch_samples: int | None
+    warnings: list[str] = field(default_factory=list)
+
+
+def survey(
+    scene: mi.Scene, sensor: mi.Sensor, integrator: mi.Integrator, spp: int, seed: int
+) -> Survey:
+    """Look at what a render of ``spp`` samples per pixel by one of ours would use.
+
+    Raises ``ValueError`` as ``integrator.prepare`` does.
+    """
+    with _warnings() as warnings:
+        each, begin = max(min(PICTURE_SPP, spp) // 2, 1), time.perf_counter()
+        for better in islice(integrator.progressive(scene, sensor, seed, each, spp), 2):
+            picture, reached, noise = np.array(better.picture), better.spp, better.error
+            now = time.perf_counter()
+            seconds, begin = now - begin, now
+        view = _view(scene, sensor, integrator, spp, seed, tuple(TYPES))
+        mapped = None
+        automatic = getattr(integrator, "maps", "") == "auto" and not integrator.cache_file
+        if automatic and not view.state.maps:
+            integrator.maps = "always"
+            try:
+                mapped = _view(scene, sensor, integrator, spp, seed, ("cluster", "served"))
+            finally:
+                integrator.maps = "auto"
+    settings = integrator.settings().for_render(n_pixels_of(sensor.film()) * spp)
+    if picture.shape[2] < 3:  # Luminance, and alpha.
+        picture = np.repeat(picture[..., :1], 3, axis=2)
+    return Survey(
+        picture[..., :3],
+        reached,
+        noise,
+        (each, seconds),
+        view,
+        mapped,
+        _patches(view.state),
+        None if integrator.cache_file else settings.patch_samples,
+        warnings,
+    )
+
+
+def _patches(state: BakedState) -> tuple[int, int, int]:
+    cells = state.cache.patches.cells.numpy()
+    cells = cells[cells >> MARK_BITS != 0]
+    dropped = cells & DROPPED != 0
+    used = cells[~dropped]
+    return len(used), int((used & UNEVEN != 0).sum()), int(dropped.sum())
+
+
+def _view(scene, sensor, integrator, spp, seed, types: tuple[str, ...]) -> View:
+    before = integrator.aovs
+    integrator.aovs = ", ".join(f"{kind}:{kind}" for kind in types)
+    try:
+        passes = integrator.progressive(scene, sensor, seed, min(AOV_SPP, spp), spp)
+        channels = np.array(next(passes).picture)
+        names = integrator.aov_names()
+    finally:
+        integrator.aovs = before
+    aovs, begin = {}, channels.shape[2] - len(names)
+    for kind, group in groupby(names, lambda name: name.partition(".")[0]):
+        end = begin + len(list(group))
+        aovs[kind] = channels[..., begin:end]
+        begin = end
+    state = integrator.prepare(scene, sensor, spp)
+    return View(state, aovs, _clusters(scene, sensor, state, aovs["served"]))
+
+
+def _clusters(scene, sensor, state: BakedState, served: np.ndarray) -> list[ClusterView]:
+    """What the rays through the centres of the pixels find of each cluster."""
+    if not state.maps:
+        return []
+    height, width = served.shape[:2]
+    y, x = np.indices((height, width), np.float32).reshape(2, -1) + 0.5
+    place = mi.Point2f(x / width, y / height)
+    ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, place, mi.Point2f(0.5))
+    si = scene.ray_intersect(mi.Ray3f(ray))
+    normal = dr.mulsign(si.n, -dr.dot(si.n, ray.d))
+    object_id = ObjectIds.of(scene)(si)
+    cell = state.cache.patches.locate(si.p, normal, object_id, si.is_valid())
+    cluster = state.cluster_of_cell[cell.index.numpy()]
+    cluster = np.where(cell.found.numpy(), cluster, len(state.maps))
+    shapes, object_id = ordered_shapes(scene), object_id.numpy()
+    served = served.reshape(-1, 3)
+    found = []
+    for index, cube_map in enumerate(state.maps):
+        there = cluster == index
+        count = np.bincount(object_id[there], minlength=len(shapes)) / len(there)
+        ranked = [i for i in np.argsort(-count, kind="stable") if count[i] > 0]
+        found.append(
+            ClusterView(
+                cube_map.cluster,
+                cube_map.masked,
+                {shapes[i].id(): float(count[i]) for i in ranked},
+                float(there.mean()),
+                tuple(served[there].mean(axis=0).tolist()) if there.any() else (0.0, 0.0, 0.0),
+            )
+        )
+    return found
+
+
+@contextmanager
+def _warnings() -> Iterator[list[str]]:
+    """What Mitsuba warns of in the block, which it still prints."""
+    found: list[str] = []
+
+    class Appender(mi.Appender):
+        def append(self, level, text):
+            if level >= mi.LogLevel.Warn:
+                found.append(text)
+
+        def log_progress(self, *_):
+            pass
+
+    appender = Appender()
+    mi.logger().add_appender(appender)
+    try:
+        yield found
+    finally:
+        mi.logger().remove_appender(appender)

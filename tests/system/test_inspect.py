@@ -1,0 +1,272 @@
+"""``envmap-render inspect``: the page, and what it is made of."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from envmap_integrator.cli import main
+from envmap_integrator.inspection.advice import about_cluster, as_xml, in_short
+from envmap_integrator.inspection.pictures import RAMP, embedded, on_ramp, shrunk, tone_mapped
+from envmap_integrator.inspection.survey import ClusterView, survey
+from envmap_integrator.inspection.unfolded import MASKED, SKY, Faces, unfolded
+from envmap_integrator.inspection.wires import wires
+from envmap_integrator.lookup.cube import face_to_direction
+from envmap_integrator.lookup.cube_map import Cluster, CubeMap
+from tests.helpers import camera, integrator, load, room
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+WIDTH, HEIGHT = 32, 24
+SCENE = """<scene version="3.0.0">
+    <integrator type="path"/>
+    <sensor type="perspective"> <float name="fov" value="80"/>
+        <transform name="to_world"> <lookat origin="0,-1.8,0.4" target="0,0.5,-1" up="0,0,1"/>
+        </transform> <sampler type="independent"> <integer name="sample_count" value="8"/>
+        </sampler> <film type="hdrfilm"> <integer name="width" value="32"/>
+        <integer name="height" value="24"/> </film> </sensor>
+    <shape type="cube" id="walls"> <transform name="to_world"> <scale value="2"/> </transform>
+        <boolean name="flip_normals" value="true"/> </shape>
+    <shape type="rectangle" id="lamp"> <transform name="to_world"> <scale value="0.5"/>
+        <rotate x="1" angle="180"/> <translate z="1.9"/> </transform>
+        <emitter type="area"> <rgb name="radiance" value="9"/> </emitter> </shape>
+    <shape type="sphere" id="ball &amp; co"> <point name="center" x="0.4" y="0.2" z="-1.6"/>
+        <float name="radius" value="0.4"/> </shape>
+    {more}
+</scene>"""
+LISTED = """<integrator type="envmap_hybrid"> <emitter type="mipmap_cube" id="desk">
+    <string name="shapes" value="ball &amp; co"/> </emitter> </integrator>"""
+PARTS = ["picture", "served", "cache", "clusters", "maps", "settings"]
+
+
+def inspect(folder: Path, more: str = "", *options: object) -> str:
+    path = folder / "room.xml"
+    path.write_text(SCENE.format(more=more).replace('<integrator type="path"/>', more and ""))
+    arguments = ("inspect", path, "--set", "patches=512", "--quiet", *options)
+    assert main([str(argument) for argument in arguments]) == 0
+    return path.with_suffix(".html").read_text(encoding="utf-8")
+
+
+def pictures(text: str) -> dict[str, np.ndarray]:
+    """The pictures on a page by what they show."""
+    found = {}
+    for uri, shown in re.findall(r'<img[^>]* src="(data:.*?)" alt="(.*?)"', text):
+        assert shown not in found
+        found[shown] = decoded(uri)
+    return found
+
+
+def decoded(uri: str) -> np.ndarray:
+    stream = mi.MemoryStream()
+    stream.write(base64.b64decode(uri.removeprefix("data:image/png;base64,")))
+    stream.seek(0)
+    return np.array(mi.Bitmap(stream))
+
+
+def test_a_page_has_all_parts_and_needs_nothing_else(tmp_path):
+    text = inspect(tmp_path, LISTED)
+    assert re.findall(r'<h2 id="(\w+)">', text) == PARTS
+    sources = re.findall(r"""(?:src|href|url)\s*[=(]\s*["']?(.{5})""", text)
+    assert set(sources) == {"data:"}
+    assert "<script" not in text and "http" not in re.sub('base64,[^"]*', "", text)
+    found = pictures(text)
+    views = [shown for shown in found if "around" not in shown]
+    assert len(views) == 7
+    for shown in views:
+        assert found[shown].shape == (HEIGHT, WIDTH, 3)
+        assert found[shown].any()
+    # From 64 x 64 texels a face down to one, side by side.
+    for shown in ("radiance around desk", "distances around desk"):
+        assert found[shown].shape == (3 * 64, 4 * 127, 4)
+    assert "They were made." in text and "weren't made" not in text
+    assert "ball &amp; co" in text and "<polyline" in text
+    for stage in ("coarse mesh", "direct light", "irradiance cache", "clusters", "maps"):
+        assert f"<td>{stage}</td>" in text
+    assert "integrator: envmap_hybrid" in text and "patches = 512" in text
+
+
+def test_maps_that_were_not_made_are_shown(tmp_path):
+    """For a scene without one of our integrators."""
+    text = inspect(tmp_path)
+    assert "They weren&#39;t made." in text
+    assert "where secondary rays would end with maps" in pictures(text)
+    assert "maps = auto" in text
+
+
+def test_json(tmp_path, capfd):
+    path = tmp_path / "room.xml"
+    path.write_text(SCENE.format(more=""))
+    page = tmp_path / "page.html"
+    options = ("--json", "--set", "patches=512", "--integrator", "one_level_path", "-o", page)
+    assert main(["inspect", str(path), *map(str, options)]) == 0
+    result = json.loads(capfd.readouterr().out)
+    assert result["output"] == str(page) and page.exists()
+    assert result["settings"]["integrator"] == "one_level_path"
+    assert "There are no maps" in page.read_text(encoding="utf-8")
+
+
+def test_a_survey_is_of_the_render_asked_for():
+    scene, ours = load(room()), integrator("envmap_hybrid", sampler="coherent", maps="auto")
+    found = survey(scene, scene.sensors()[0], ours, 64, seed=0)
+    tables = (s.cache.table.numpy() for s in (found.view.state, ours.prepare(scene, spp=64)))
+    np.testing.assert_array_equal(*tables)
+    assert (ours.maps, ours.aovs) == ("auto", "")
+    assert found.spp == 16 and found.timed[0] == 8 and found.timed[1] > 0
+    assert found.mapped is not None and found.mapped.state.maps
+    assert found.picture.shape == (HEIGHT, WIDTH, 3) and 0 < found.noise < 1
+    for view in found.mapped.clusters:
+        assert 0 <= view.seen <= 1 and sum(view.served) <= 1 + 1e-5
+        assert sum(view.shapes.values()) == pytest.approx(view.seen)
+    seen = [view for view in found.mapped.clusters if view.seen > 0]
+    assert seen and set().union(*(view.shapes for view in seen)) <= {"block", "ball", "lamp"}
+    assert 0 < found.patches[0] <= 2 * ours.patches
+    assert len(in_short(found)) >= 3
+
+
+def test_warnings_are_kept():
+    scene, ours = load(room()), integrator("envmap_hybrid", sampler="coherent", patch_samples=1)
+    prepare = ours.prepare
+
+    def loud(*arguments):
+        mi.Log(mi.LogLevel.Warn, "too dark")
+        return prepare(*arguments)
+
+    ours.prepare = loud
+    assert any("too dark" in w for w in survey(scene, scene.sensors()[0], ours, 4, 0).warnings)
+
+
+# ---------------------- Cubes ----------------------
+
+
+def cube(centre, half_width: float) -> Cluster:
+    return Cluster("cluster0", np.array(centre, float), half_width / 2, half_width)
+
+
+def test_wires_are_where_a_sensor_sees_them():
+    """A cube ahead, of which the far face is behind a wall."""
+    sensor = camera(200, 100, origin=(0, 0, 0), target=(0, 5, 0), fov=90, near_clip=0.1)
+    wall = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().translate([0, 5.5, 0]).rotate([1, 0, 0], 90).scale(9),
+    }
+    scene = load(room(sensor=sensor, walls=wall, block=None, ball=None))
+    drawn = wires(scene, scene.sensors()[0], cube((0, 5, 0), 1))
+    near, far = 100 / 4, 100 / 6  # pixels off the middle
+    solid = np.concatenate([points for points, hidden in drawn.lines if not hidden])
+    pale = np.concatenate([points for points, hidden in drawn.lines if hidden])
+    middle = np.array([100, 50])
+    for points, largest in ((solid, near), (pale, 100 / 5.5)):
+        assert np.abs(points - middle).max() == pytest.approx(largest, abs=0.3)
+    assert np.abs(pale - middle).max(axis=1).min() == pytest.approx(far, abs=0.1)
+    np.testing.assert_allclose(drawn.label, middle, atol=1e-3)
+
+
+def test_wires_stay_in_the_picture():
+    """With the camera in the middle of the cube, and turned away from it."""
+    scene = load(room())
+    sensor = scene.sensors()[0]
+    drawn = wires(scene, sensor, cube((0, -1.8, 0.4), 1))
+    points = np.concatenate([points for points, _ in drawn.lines])
+    assert (points >= 0).all() and (points <= (WIDTH, HEIGHT)).all()
+    nothing = wires(scene, sensor, cube((0, -9, 0.4), 1))
+    assert nothing.lines == [] and nothing.label is None
+
+
+# ---------------------- Maps ----------------------
+
+
+def map_of_directions(resolution: int = 4) -> CubeMap:
+    """Its radiance is 1 + the direction of each texel, its distance 2, but for what is above."""
+    levels = []
+    while resolution:
+        face, y, x = np.indices((6, resolution, resolution), np.float32).reshape(3, -1)
+        uv = mi.Point2f((x + 0.5) * 2 / resolution - 1, (y + 0.5) * 2 / resolution - 1)
+        d = np.array(dr.normalize(face_to_direction(mi.UInt32(face), uv))).T
+        inverse = np.where(face == 4, 0, np.where(face == 5, -0.5, 0.5))[:, None]
+        level = np.concatenate([1 + d, inverse], axis=1)
+        levels.append(level.reshape(6, resolution, resolution, 4).astype(np.float32))
+        resolution //= 2
+    return CubeMap(cube((0, 0, 0), 1), levels)
+
+
+@pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0)])
+def test_crosses_are_as_the_camera_looks(up):
+    """Ahead in the middle, and no seams beside it."""
+    ahead = np.array([0.9, 0.1, 0.3] if up[2] else [0.1, 0.2, -0.9])
+    sensor = mi.load_dict(
+        {
+            "type": "perspective",
+            "to_world": mi.ScalarTransform4f().look_at([0, 0, 0], ahead.tolist(), list(up)),
+        }
+    )
+    faces = Faces.of(sensor)
+    right = [0, -1, 0] if up[2] else [1, 0, 0]
+    np.testing.assert_array_equal(faces.up, up)
+    np.testing.assert_array_equal(faces.right, right)
+    cross, covered = faces.cross(map_of_directions(16).levels[0])
+    d = cross[..., :3] - 1
+    assert covered.sum() == 6 * 16**2
+
+    def middle(row, column):
+        return d[row * 16 + 7 : row * 16 + 9, column * 16 + 7 : column * 16 + 9].mean(axis=(0, 1))
+
+    expected = {(1, 0): -faces.right, (1, 1): faces.ahead, (1, 2): right, (1, 3): -faces.ahead}
+    for (row, column), axis in (expected | {(0, 1): faces.up, (2, 1): -faces.up}).items():
+        np.testing.assert_allclose(middle(row, column), axis, atol=0.02)
+    assert np.abs(np.diff(d[16:32], axis=1)).max() < 0.2
+    assert np.abs(np.diff(d[:, 16:32], axis=0)).max() < 0.2
+
+
+def test_distances_show_what_is_known():
+    sensor = mi.load_dict(camera())
+    radiance, distance, near, far = unfolded(map_of_directions(), Faces.of(sensor))
+    assert radiance.shape == distance.shape == (12, 16 + 8 + 4, 4)
+    assert near == pytest.approx(2) and far > near
+    above, below, ahead = distance[2, 6, :3], distance[10, 6, :3], distance[6, 6, :3]
+    assert tuple(above) == SKY and tuple(below) == MASKED
+    np.testing.assert_array_equal(ahead, RAMP[0])
+    assert distance[0, 0, 3] == 0 and distance[2, 6, 3] == 255
+
+
+# ---------------------- Pictures and words ----------------------
+
+
+def test_pictures_survive_as_text():
+    picture = np.random.default_rng(0).integers(0, 256, (5, 7, 3), np.uint8)
+    np.testing.assert_array_equal(decoded(embedded(picture)), picture)
+
+
+def test_scales():
+    values = np.array([0, 0.01, 0.1, 1, 9])
+    np.testing.assert_array_equal(on_ramp(values, 0.01, 1), RAMP[[0, 0, 2, 4, 4]])
+    np.testing.assert_array_equal(tone_mapped(np.array([0, 0.5, 2, np.nan]), 1.0), [0, 188, 255, 0])
+    large = np.ones((100, 2000, 3))
+    assert shrunk(large).shape == (33, 666, 3) and (shrunk(large) == 1).all()
+
+
+@pytest.mark.parametrize(
+    ("served", "masked", "words"),
+    [
+        ((0.1, 0.2, 0.7), 0.5, "Nothing odd"),
+        ((0.1, 0.7, 0.2), 0.5, "lower distance_ratio (here 2)"),
+        ((0.5, 0.1, 0.4), 0.5, "Raise distance_ratio (here 2)"),
+        ((0.1, 0.2, 0.7), 0.95, "95\u00a0% of the map is behind walls"),
+    ],
+)
+def test_advice(served, masked, words):
+    view = ClusterView(cube((0, 0, 0), 1), masked, {"ball & co": 0.1, "": 0.2}, 0.1, served)
+    assert words in " ".join(about_cluster(view))
+    # What it gives to be changed by hand loads.
+    text = as_xml(view)
+    loaded = mi.load_string(
+        f'<scene version="3.0.0"> <integrator type="envmap_hybrid"> {text} </integrator> </scene>'
+    ).integrator()
+    assert loaded.requests[0].shape_ids == ("ball & co",)
+    assert loaded.requests[0].distance_ratio == 2
