@@ -27,7 +27,7 @@ from envmap_integrator.system.llvm import ensure_llvm
 def render(args: argparse.Namespace) -> int:
     """Render one sensor; write the picture with its settings and stage times in its header."""
     output = args.output or args.scene.with_suffix(".exr")
-    _check_output(output)
+    check_output(output, " (--png adds a PNG)")
     _require(args.spp >= 0, f"--spp must not be negative, got {args.spp}")
     _configure_machine(args)
     seconds: dict[str, float] = {}
@@ -162,7 +162,7 @@ def _denoise(bitmap: mi.Bitmap, scene: mi.Scene, settings: dict[str, object]) ->
 
 def bake(args: argparse.Namespace) -> int:
     """Run the integrator's pre-passes alone and save their result."""
-    _check_output(args.output)
+    check_output(args.output)
     _configure_machine(args)
     seconds: dict[str, float] = {}
     with record_kernels():
@@ -176,7 +176,11 @@ def bake(args: argparse.Namespace) -> int:
         seconds |= state.stage_times
         compilation = compilation_time()
     state.save(args.output)
-    _report(args, seconds, compilation, args.output)
+    maps = {m.cluster.name: m.resolution for m in state.maps}
+    _report(args, seconds, compilation, args.output, maps=maps)
+    if maps and not (args.quiet or args.json):
+        listed = ", ".join(f"{name} ({n} x {n})" for name, n in maps.items())
+        print(f"maps: {listed}")
     return 0
 
 
@@ -234,9 +238,9 @@ def _settings(
     }
 
 
-def _check_output(path: Path) -> None:
+def check_output(path: Path, hint: str = "") -> None:
     """Fail before the work starts rather than after it."""
-    _require(path.suffix == ".exr", f'output "{path}" must end in .exr (--png adds a PNG)')
+    _require(path.suffix == ".exr", f'output "{path}" must end in .exr{hint}')
     check_writable(path)
 
 
