@@ -41,8 +41,8 @@ def masked_texels_trusted() -> AbstractContextManager:
     """
     inverse_distance = FarField._inverse_distance
 
-    def read_unsigned(self, cluster, d, active):
-        return dr.abs(inverse_distance(self, cluster, d, active))
+    def read_unsigned(self, layout, d, active):
+        return dr.abs(inverse_distance(self, layout, d, active))
 
     return patch.object(FarField, "_inverse_distance", read_unsigned)
 

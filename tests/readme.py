@@ -16,8 +16,8 @@ from tests.helpers import ROOT
 
 README = ROOT / "README.md"
 
-#: XML elements of the types that docstrings name.
-ELEMENTS = {"int": "integer", "float": "float", "bool": "boolean", "string": "string"}
+#: XML elements of the types that docstrings name, where they have another name.
+ELEMENTS = {"int": "integer", "float": "float", "bool": "boolean"}
 
 _PARAMETER = re.compile(r"^ \* - (\w+)\n +- \|(\w+)\|\n +- (.*?)(?=^ \* - |\Z)", re.M | re.S)
 _DEFAULT = re.compile(r" ?\(Default: (.*)\)$")
@@ -55,7 +55,9 @@ def documented(plugin: type) -> list[Parameter]:
 def _parameter(name: str, kind: str, words: str) -> Parameter:
     default = _DEFAULT.search(words)
     meaning = words[: default.start()] if default else words
-    return Parameter(name, ELEMENTS[kind], default[1] if default else "", _markdown(meaning))
+    return Parameter(
+        name, ELEMENTS.get(kind, kind), default[1] if default else "", _markdown(meaning)
+    )
 
 
 def _markdown(text: str) -> str:

@@ -1,4 +1,4 @@
-"""``envmap-render``: render, bake and diagnose from the shell.
+"""``envmap-render``: render, bake, export maps and diagnose from the shell.
 
 The stock ``mitsuba`` executable can't load plugins written in Python; this one echoes its flags.
 """
@@ -16,6 +16,7 @@ from typing import NoReturn
 from envmap_integrator.cli import commands
 from envmap_integrator.cli.doctor import doctor
 from envmap_integrator.cli.errors import condense
+from envmap_integrator.cli.export import export
 from envmap_integrator.cli.scene_file import parse_assignment, parse_setting
 from envmap_integrator.system import progress
 from envmap_integrator.system.interrupt import interruptible
@@ -79,6 +80,17 @@ RENDER_EXAMPLES = """examples:
 BAKE_EXAMPLES = """examples:
   envmap-render bake room.xml --integrator envmap_hybrid -o state.exr
   envmap-render render room.xml --integrator envmap_hybrid --set cache_file=state.exr
+
+  # Clusters of your choice, each with a map: the same settings with the cache_file.
+  envmap-render bake room.xml --integrator envmap_hybrid -o state.exr \\
+      --set desk.shapes="table, ball" --set desk.resolution=128 --set desk.center="0, 1, 0.5"
+  envmap-render bake room.xml --integrator envmap_hybrid -o state.exr \\
+      --set maps=always --set no_cluster="lamp, curtain"
+
+"""
+EXPORT_EXAMPLES = """examples:
+  envmap-render export state.exr --map desk -o desk.exr        # for mipmap_cube and other tools
+  envmap-render export desk.exr --latlong -o sky.exr           # for Mitsuba's envmap
 
 """
 INSPECT_EXAMPLES = """examples:
@@ -163,6 +175,24 @@ def build_parser() -> argparse.ArgumentParser:
     inspect.add_argument("--seed", type=int, default=0, help="of the sampler")
     inspect.set_defaults(command=commands.inspect, denoise=False)
 
+    convert = subparsers.add_parser(
+        "export",
+        help="write a map for other tools",
+        description="Write a map of a baked state, or a cube map of another tool, as an OpenEXR "
+        "cube map, its levels as parts. Emitters that shadow rays sample aren't in baked maps.",
+        epilog=EXPORT_EXAMPLES + EXIT_CODES,
+    )
+    convert.add_argument("file", type=Path, metavar="FILE.exr", help="baked state or cube map")
+    convert.add_argument("-o", "--output", type=Path, required=True)
+    convert.add_argument("--map", default="", metavar="NAME", help="default: the first of a state")
+    convert.add_argument(
+        "--latlong", action="store_true", help="for Mitsuba's envmap, y upwards, instead of a cube"
+    )
+    _add_mode(convert)
+    convert.add_argument("--quiet", action="store_true", help="errors alone")
+    convert.add_argument("--debug", action="store_true", help="show tracebacks")
+    convert.set_defaults(command=export)
+
     check = subparsers.add_parser("doctor", help="say what this machine can render with")
     check.add_argument("--debug", action="store_true", help=argparse.SUPPRESS)
     check.set_defaults(command=doctor)
@@ -171,9 +201,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 def _add_scene_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", type=Path, metavar="SCENE.xml")
-    parser.add_argument(
-        "-m", "--mode", default="llvm_ad_rgb", metavar="VARIANT", help="default: %(default)s"
-    )
+    _add_mode(parser)
     parser.add_argument("-t", "--threads", type=int, help="default: one per core")
     parser.add_argument(
         "-D", "--define", type=parse_assignment, action="append", default=[], metavar="KEY=VALUE",
@@ -184,7 +212,8 @@ def _add_scene_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--set", type=parse_setting, action="append", default=[], metavar="KEY=VALUE",
-        help="integrator parameter: true, false, an integer, a float (1.0) or a string",
+        help="integrator parameter: true, false, an integer, a float (1.0) or a string; "
+        "CHILD.KEY: of what is nested in it, shapes make a cluster",
     )  # fmt: skip
     output = parser.add_mutually_exclusive_group()
     output.add_argument(
@@ -194,3 +223,9 @@ def _add_scene_options(parser: argparse.ArgumentParser) -> None:
         "--json", action="store_true", help="what there is to know of the result as JSON instead"
     )
     parser.add_argument("--debug", action="store_true", help="show tracebacks")
+
+
+def _add_mode(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "-m", "--mode", default="llvm_ad_rgb", metavar="VARIANT", help="default: %(default)s"
+    )

@@ -29,7 +29,7 @@ from envmap_integrator.system.llvm import ensure_llvm
 def render(args: argparse.Namespace) -> int:
     """Render one sensor; write the picture with its settings and stage times in its header."""
     output = args.output or args.scene.with_suffix(".exr")
-    _check_output(output)
+    check_output(output, hint=" (--png adds a PNG)")
     _require(args.spp >= 0, f"--spp must not be negative, got {args.spp}")
     _configure_machine(args)
     seconds: dict[str, float] = {}
@@ -168,7 +168,7 @@ INSPECTED = ("envmap_hybrid", "one_level_path")
 
 def bake(args: argparse.Namespace) -> int:
     """Run the integrator's pre-passes alone and save their result."""
-    _check_output(args.output)
+    check_output(args.output)
     _configure_machine(args)
     seconds: dict[str, float] = {}
     with record_kernels():
@@ -182,14 +182,18 @@ def bake(args: argparse.Namespace) -> int:
         seconds |= state.stage_times
         compilation = compilation_time()
     state.save(args.output)
-    _report(args, seconds, compilation, args.output)
+    maps = {m.cluster.name: m.resolution for m in state.maps}
+    _report(args, seconds, compilation, args.output, maps=maps)
+    if maps and not (args.quiet or args.json):
+        listed = ", ".join(f"{name} ({n} x {n})" for name, n in maps.items())
+        print(f"maps: {listed}")
     return 0
 
 
 def inspect(args: argparse.Namespace) -> int:
     """Write a page that shows what was prepared for a picture, and what its rays do."""
     output = args.output or args.scene.with_suffix(".html")
-    _check_output(output, ".html")
+    check_output(output, ".html")
     _require(args.spp >= 0, f"--spp must not be negative, got {args.spp}")
     template = load_template()  # Fails before the work starts, if it's missing.
     _configure_machine(args)
@@ -272,10 +276,9 @@ def _settings(
     }
 
 
-def _check_output(path: Path, suffix: str = ".exr") -> None:
+def check_output(path: Path, suffix: str = ".exr", hint: str = "") -> None:
     """Fail before the work starts rather than after it."""
-    more = " (--png adds a PNG)" if suffix == ".exr" else ""
-    _require(path.suffix == suffix, f'output "{path}" must end in {suffix}{more}')
+    _require(path.suffix == suffix, f'output "{path}" must end in {suffix}{hint}')
     check_writable(path)
 
 

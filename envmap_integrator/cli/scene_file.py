@@ -51,12 +51,18 @@ class SceneFile:
     ) -> None:
         """Use the plugin ``name`` (None: the present one) and ``settings``.
 
-        The present plugin's own parameters stay with it unless ``keep`` is False.
+        The present plugin's own parameters stay with it unless ``keep`` is False. ``a.b`` is
+        parameter ``b`` of what is nested in the integrator as ``a``; ``a.shapes`` makes it, if
+        there is none. Raises ``ValueError`` if there is none.
         """
         if name is not None and (name != self.integrator.plugin_name() or not keep):
             self._integrator_node.props = mi.Properties(name)
-        for key, value in (settings or {}).items():
-            self.integrator[key] = value
+        settings = settings or {}
+        # Shapes first: they may make what the others are parameters of.
+        for key in sorted(settings, key=lambda key: not key.endswith(".shapes")):
+            child, dot, parameter = key.rpartition(".")
+            props = self._nested(child, parameter) if dot else self.integrator
+            props[parameter] = settings[key]
 
     @property
     def film_size(self) -> tuple[int, int]:
@@ -119,9 +125,26 @@ class SceneFile:
             return mi.parser.instantiate(self._config, state)
 
     def _lists_shapes(self) -> bool:
-        """Does the integrator hold clusters that the user has listed?"""
+        """Does the integrator name shapes, in clusters that the user has listed or excluded?"""
         emitters = self._children(self._integrator_node, mi.ObjectType.Emitter)
-        return any("shapes" in emitter.props for emitter in emitters)
+        listed = any("shapes" in emitter.props for emitter in emitters)
+        return listed or "no_cluster" in self.integrator
+
+    def _nested(self, name: str, parameter: str) -> mi.Properties:
+        """Parameters of the integrator's child of that name or id."""
+        children = self._named_children(self._integrator_node)
+        for key, node in children:
+            if name in (key, node.props.id()):
+                return node.props
+        if parameter != "shapes":
+            there = ", ".join(node.props.id() or key for key, node in children)
+            raise ValueError(
+                f'"{name}.{parameter}": integrator "{self.integrator.plugin_name()}" holds no '
+                f'"{name}", only {there or "parameters"}; set "{name}.shapes" too for a cluster of '
+                "that name"
+            )
+        self._append_child(self._integrator_node, mi.ObjectType.Emitter, "mipmap_cube", name)
+        return self._nested(name, parameter)
 
     @property
     def _integrator_node(self) -> mi.parser.SceneNode:
@@ -130,22 +153,26 @@ class SceneFile:
     def _children(
         self, parent: mi.parser.SceneNode, kind: mi.ObjectType
     ) -> list[mi.parser.SceneNode]:
+        return [node for _, node in self._named_children(parent) if node.type == kind]
+
+    def _named_children(self, parent: mi.parser.SceneNode) -> list[tuple[str, mi.parser.SceneNode]]:
         # A copy: Mitsuba takes what has been read for known, and would miss misspelt names.
-        references = [
-            value
-            for _, value in mi.Properties(parent.props).items()
+        return [
+            (name, self._state.nodes[value.index()])
+            for name, value in mi.Properties(parent.props).items()
             if isinstance(value, mi.Properties.ResolvedReference)
         ]
-        nodes = [self._state.nodes[reference.index()] for reference in references]
-        return [node for node in nodes if node.type == kind]
 
-    def _append_child(self, parent: mi.parser.SceneNode, kind: mi.ObjectType, plugin: str) -> None:
+    def _append_child(
+        self, parent: mi.parser.SceneNode, kind: mi.ObjectType, plugin: str, name: str = ""
+    ) -> None:
         # Link first: appending may move the nodes in memory, which invalidates `parent`.
         index = len(self._state.nodes)
-        parent.props[f"_{plugin}"] = mi.Properties.ResolvedReference(index)
+        parent.props[name or f"_{plugin}"] = mi.Properties.ResolvedReference(index)
         node = mi.parser.SceneNode()
         node.type = kind
         node.props = mi.Properties(plugin)
+        node.props.set_id(name)
         self._state.nodes.append(node)
 
 

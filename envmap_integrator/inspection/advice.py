@@ -70,7 +70,7 @@ def about_cluster(view: ClusterView) -> list[str]:
     ratio = f"distance_ratio (here {cluster.half_width / cluster.radius:.3g})"
     found = []
     if view.seen == 0:
-        found.append("This sensor doesn't see it.")
+        found.append("This sensor doesn't see it: no_cluster leaves its shapes out.")
     if cached > mapped:
         found.append(
             "More rays hit something inside the cube than come to use the map: lower "
@@ -85,7 +85,7 @@ def about_cluster(view: ClusterView) -> list[str]:
     if view.masked > MASKED:
         found.append(
             f"{percent(view.masked)} of the map is behind walls or inside of objects: lower "
-            f"{ratio}, or list other shapes."
+            f"{ratio}, move its center, or list other shapes."
         )
     return found or ["Nothing odd."]
 

@@ -67,6 +67,9 @@ class EnvmapHybrid(GatheringIntegrator):
        - |string|
        - ``auto`` makes maps of automatic clusters if they are predicted to pay, ``always`` in any
          case. (Default: auto)
+     * - no_cluster
+       - |string|
+       - Ids of shapes that belong to no automatic cluster, separated by commas. (Default: none)
      * - map_resolution
        - |int|
        - Texels along the edge of a map's face, a power of two up to 2048. (Default: 64)
@@ -124,6 +127,7 @@ class EnvmapHybrid(GatheringIntegrator):
                 </integrator>
                 <emitter type="mipmap_cube" id="desk">
                     <string name="shapes" value="table, ball"/>
+                    <point name="center" x="0" y="1" z="0.5"/>
                 </emitter>
             </integrator>
 
@@ -132,7 +136,7 @@ class EnvmapHybrid(GatheringIntegrator):
             'type': 'envmap_hybrid',
             'distance_ratio': 3.0,
             'baker': {'type': 'envmap_bake', 'samples': 16},
-            'desk': {'type': 'mipmap_cube', 'shapes': 'table, ball'}
+            'desk': {'type': 'mipmap_cube', 'shapes': 'table, ball', 'center': [0, 1, 0.5]}
     """
 
     def __init__(self, props: mi.Properties):
@@ -143,6 +147,7 @@ class EnvmapHybrid(GatheringIntegrator):
         self.lookup = parameters.choice("lookup", "corrected", ("corrected", "plain"))
         self.mirrors = parameters.choice("mirrors", "trace", ("trace", "map"))
         self.maps = parameters.choice("maps", "auto", ("auto", "always"))
+        self.no_cluster = parameters.names("no_cluster")
         self.map_resolution = parameters.power_of_two("map_resolution", 64, 1, MAX_RESOLUTION)
         self.distance_ratio = parameters.number("distance_ratio", 2.0, 1.0)
         self.mip_bias = parameters.number("mip_bias", -2.0, -32.0, 32.0)
@@ -159,6 +164,12 @@ class EnvmapHybrid(GatheringIntegrator):
                     f'{self.owner}: the nested {child.class_name()} "{child.id()}" must be one '
                     'envmap_bake or a mipmap_cube with "shapes"'
                 )
+            for shape_id in self.no_cluster:
+                if requests and shape_id in requests[-1].shapes:
+                    raise ValueError(
+                        f'{self.owner}: "no_cluster" names shape "{shape_id}", which mipmap_cube '
+                        f'"{requests[-1].name}" lists; leave it out of one of them'
+                    )
         self.requests = tuple(requests)
         self.baker = self.baker or mi.load_dict({"type": "envmap_bake"})
 
@@ -172,6 +183,7 @@ class EnvmapHybrid(GatheringIntegrator):
             map_mirrors=self.mirrors == "map",
             map_always=self.maps == "always" or self.mirrors == "map",
             requests=self.requests,
+            no_cluster=self.no_cluster,
         )
 
     def rules(self, seed: int) -> PathRules:

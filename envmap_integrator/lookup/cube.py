@@ -92,6 +92,18 @@ def solid_angles(resolution: int) -> np.ndarray:
     return corner[1:, 1:] - corner[1:, :-1] - corner[:-1, 1:] + corner[:-1, :-1]
 
 
+def texel_directions(resolution: int) -> np.ndarray:
+    """Directions (not normalised) of the centres of texels, [face, y, x, 3]."""
+    centre = (2 * np.arange(resolution) + 1) / resolution - 1
+    d = np.empty((6, resolution, resolution, 3))
+    for face in range(6):
+        axis = face // 2
+        d[face, ..., axis] = -1 if face % 2 else 1
+        d[face, ..., (axis + 1) % 3] = centre
+        d[face, ..., (axis + 2) % 3] = centre[:, None]
+    return d
+
+
 def exit_distance(
     centre: mi.Point3f, half_width: mi.Float, o: mi.Point3f, d: mi.Vector3f
 ) -> mi.Float:

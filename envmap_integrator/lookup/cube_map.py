@@ -15,7 +15,7 @@ class Cluster:
     """Surfaces that share a cube.
 
     name         for messages and files
-    centre       [3] of the box around the surfaces, world space
+    centre       [3] of the cube, world space; unless asked for, that of the box around the surfaces
     radius       largest distance of the surfaces from the centre along an axis, world units
     half_width   of the cube around the centre, world units
     benefit      part of the variance of what the sensors see that its map takes off, as predicted

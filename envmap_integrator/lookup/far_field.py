@@ -41,11 +41,11 @@ class FarField:
     """Radiance and distance beyond the cubes of all clusters.
 
     cubes              [M * 4]   centre and half width of each cube, world units
-    texels             [M * T * (C + 1)]  radiance [W/m²/sr] by C channels and inverse distance
-                                 [1/m] from the centre, negative where masked; T texels a map,
-                                 laid out as in ``cube``
+    texels             [T * (C + 1)]  radiance [W/m²/sr] by C channels and inverse distance [1/m]
+                                 from the centre, negative where masked; all maps, one after the
+                                 other, each laid out as in ``cube``
+    layout             [M * 2]   face resolution R of the finest level and first texel of each map
     cluster_of_cell    cluster index of each large cell of the coarse mesh, M where there is none
-    resolution         [1]       face resolution R of the finest level
     n_samples          [1]       samples that share a pixel: spp times secondary samples
     mip_bias           [1]       levels added to the look-up
     map_mirrors        whether mirrors and narrow lobes read the map too (else traced)
@@ -56,9 +56,9 @@ class FarField:
 
     cubes: mi.Float
     texels: mi.Float
+    layout: mi.UInt32
     cluster_of_cell: mi.UInt32
     n_clusters: mi.UInt32
-    resolution: mi.UInt32
     n_samples: mi.Float
     mip_bias: mi.Float
     corrected: bool
@@ -111,6 +111,8 @@ class FarField:
         """
         cube = dr.gather(mi.Vector4f, self.cubes, cluster, active)
         centre = mi.Point3f(cube.x, cube.y, cube.z)
+        layout = dr.gather(mi.Vector2u, self.layout, cluster, active)
+        resolution = layout.x
         offset, d = ray.o - centre, ray.d
         trusted = mi.Bool(True)
         footprint = mi.Float(1)
@@ -121,11 +123,11 @@ class FarField:
             b = dr.dot(offset, d)
             c = dr.squared_norm(offset)
             for _ in range(CORRECTION_STEPS):
-                inverse = dr.abs(self._inverse_distance(cluster, far, active))
+                inverse = dr.abs(self._inverse_distance(layout, far, active))
                 # |offset + t d| = 1 / inverse, in a form that stands infinite distance.
                 t = dr.safe_sqrt(dr.rcp(dr.square(inverse)) - c + b * b) - b
                 far = dr.select(inverse > 0, offset + t * d, d)
-            inverse_at = self._inverse_distance(cluster, far, active)
+            inverse_at = self._inverse_distance(layout, far, active)
             distance = dr.select(inverse > 0, dr.norm(far), dr.inf)
             trusted = dr.select(
                 inverse > 0,
@@ -137,17 +139,17 @@ class FarField:
         face, uv = direction_to_face(far)
         solid_angle = footprint / (self.n_samples * pdf)
         solid_angle = dr.select(specular, 0, solid_angle)
-        texels = solid_angle * dr.square(mi.Float(self.resolution)) * 0.25
+        texels = solid_angle * dr.square(mi.Float(resolution)) * 0.25
         texels *= (1 + dr.squared_norm(uv)) ** 1.5
         level = 0.5 * dr.log2(dr.maximum(texels, 1e-6)) + self.mip_bias
-        coarsest = mi.Float(31 - dr.lzcnt(self.resolution))
+        coarsest = mi.Float(31 - dr.lzcnt(resolution))
         # Stochastic trilinear filtering: one packed gather. Low bits of the random number choose
         # the face where three meet.
         level = mi.UInt32(dr.clip(dr.floor(level + u_level), 0, coarsest))
-        level_resolution = self.resolution >> level
+        level_resolution = resolution >> level
         uv += (2 * u_texel - 1) / mi.Float(level_resolution)
         face, uv = fold(face, uv, 256 * u_texel.x - dr.floor(256 * u_texel.x))
-        value = self._fetch(cluster, face, uv, level_resolution, active)
+        value = self._fetch(layout, face, uv, level_resolution, active)
         n_channels = len(mi.Spectrum())
         return mi.Spectrum(*(value[i] for i in range(n_channels))), trusted
 
@@ -167,13 +169,12 @@ class FarField:
         count(Ray.SHADOW, ray, found)
         return si, found & ~scene.ray_test(ray, found)
 
-    def _inverse_distance(self, cluster, d, active):
+    def _inverse_distance(self, layout, d, active):
         face, uv = direction_to_face(d)
-        return self._fetch(cluster, face, uv, self.resolution, active)[len(mi.Spectrum())]
+        return self._fetch(layout, face, uv, layout.x, active)[len(mi.Spectrum())]
 
-    def _fetch(self, cluster, face, uv, level_resolution, active):
-        first = cluster * n_texels(self.resolution)
-        index = first + texel(face, uv, self.resolution, level_resolution)
+    def _fetch(self, layout, face, uv, level_resolution, active):
+        index = layout.y + texel(face, uv, layout.x, level_resolution)
         return dr.gather(texel_type(), self.texels, index, active)
 
 
@@ -190,12 +191,14 @@ def far_field(
     if not maps:
         return None
     cubes = [[*cube_map.cluster.centre, cube_map.cluster.half_width] for cube_map in maps]
+    resolutions = [cube_map.resolution for cube_map in maps]
+    first = np.cumsum([0, *map(n_texels, resolutions)])[:-1]
     return FarField(
         cubes=upload(mi.Float, np.array(cubes, dtype=np.float32)),
         texels=upload(mi.Float, np.concatenate([cube_map.texels() for cube_map in maps])),
+        layout=upload(mi.UInt32, np.stack([resolutions, first], axis=-1)),
         cluster_of_cell=upload(mi.UInt32, cluster_of_cell),
         n_clusters=dr.opaque(mi.UInt32, len(maps)),
-        resolution=dr.opaque(mi.UInt32, maps[0].resolution),
         n_samples=dr.opaque(mi.Float, n_samples),
         mip_bias=dr.opaque(mi.Float, mip_bias),
         corrected=corrected,

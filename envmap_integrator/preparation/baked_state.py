@@ -51,6 +51,7 @@ class Settings:
     map_mirrors: bool = False
     map_always: bool = False
     requests: tuple[ClusterRequest, ...] = ()
+    no_cluster: tuple[str, ...] = ()
 
     def for_render(self, n_samples: int) -> Settings:
         """With a coarse mesh and a cache as fine as so many camera samples are worth.
@@ -89,10 +90,10 @@ class StateKey:
         if scene != self.scene:
             differing = difference(scene, self.scene)
             return "made for another scene" + (f": it has other {differing}" if differing else "")
-        for name, ours in _plain(self.settings).items():
-            theirs = settings.get(name)
-            if theirs != ours:
-                return f"made with {name}={theirs!r}, not {name}={ours!r}"
+        theirs, ours = _flat(settings), _flat(_plain(self.settings))
+        for name in ours | theirs:
+            if theirs.get(name) != ours.get(name):
+                return f"made with {name}={theirs.get(name)!r}, not {name}={ours.get(name)!r}"
         return ""
 
 
@@ -247,6 +248,16 @@ def _prepared(stored: Stored, key: StateKey, n_emitters: int) -> BakedState:
 def _plain(settings: Settings) -> dict[str, Any]:
     """Settings as JSON gives them back."""
     return json.loads(json.dumps(asdict(settings)))
+
+
+def _flat(settings: dict[str, Any]) -> dict[str, Any]:
+    """The same with those of each listed cluster by themselves, as ``cluster.name``."""
+    found = {name: value for name, value in settings.items() if name != "requests"}
+    requests = settings.get("requests")
+    for request in requests if isinstance(requests, list) else [requests]:
+        its = request if isinstance(request, dict) else {"": request}  # Files may hold anything.
+        found |= {f"{its.get('name')}.{name}": value for name, value in its.items()}
+    return found
 
 
 def _image(values: np.ndarray) -> np.ndarray:

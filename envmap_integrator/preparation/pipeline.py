@@ -27,6 +27,7 @@ from .maps.clusters import (
     cluster_of_cell,
     find_clusters,
     listed_clusters,
+    shapes_named,
     worthwhile,
 )
 from .radiosity.direct_light import choose_emitters, survey_direct_light
@@ -97,7 +98,7 @@ def prepare(
     maps, membership = (), None
     if settings.maps:
         with _timed(times, "clusters"):
-            clusters, cluster_of_point = _clusters(scene, mesh, solution, settings)
+            clusters, cluster_of_point = _clusters(scene, mesh, solution, settings, owner)
             membership = cluster_of_cell(len(clusters), cluster_of_point, mesh)
         with _timed(times, "maps"):
             members = [points.take(cluster_of_point == i) for i in range(len(clusters))]
@@ -117,15 +118,16 @@ def prepare(
     )
 
 
-def _clusters(scene, mesh, solution, settings):
+def _clusters(scene, mesh, solution, settings, owner):
     """Those that are listed, or those found whose maps would pay: see ``find_clusters``."""
     points, space = mesh.points, mesh.space_of_point
+    excluded = shapes_named(scene, settings.no_cluster, f'{owner}: "no_cluster"')
     share = np.where(mesh.patch_of_point >= 0, solution.escaped_share[mesh.patch_of_point], 0)
     if settings.requests:
         found = listed_clusters(points, space, scene, settings.requests, settings.distance_ratio)
     # Clusters are only looked for if they would pay at least if everything belonged to one.
     elif settings.map_always or worthwhile(benefit(points, share)):
-        found = find_clusters(points, space, settings.distance_ratio)
+        found = find_clusters(points, space, settings.distance_ratio, excluded[points.object_id])
     else:
         found = [], np.full(len(points), -1)
     clusters, cluster_of_point = found
@@ -140,22 +142,34 @@ def _clusters(scene, mesh, solution, settings):
 
 
 def _baked(scene, lookup, clusters, members, settings, owner) -> tuple[CubeMap, ...]:
-    resolution = settings.map_resolution
-    check_memory(
-        owner,
-        f"{len(clusters)} maps of {resolution} x {resolution} texels a face",
-        len(clusters) * 6 * resolution**2 * TEXEL_MEMORY,
-        'lower "map_resolution" or list fewer clusters',
-    )
+    asked = {request.name: request.resolution for request in settings.requests}
+    resolutions = [asked.get(c.name) or settings.map_resolution for c in clusters]
     rules = as_baked(settings.map_shadow_samples)
 
     def radiance_distance(sampler, ray, active):
         found = camera_radiance(scene, lookup, rules, sampler, ray, active)
         return found.radiance, found.distance
 
-    return bake_maps(
-        scene, radiance_distance, clusters, members, resolution, settings.map_samples, seed=1
-    )
+    maps = {}
+    for resolution in sorted(set(resolutions)):
+        chosen = [i for i, its in enumerate(resolutions) if its == resolution]
+        check_memory(
+            owner,
+            f"{len(chosen)} maps of {resolution} x {resolution} texels a face",
+            len(chosen) * 6 * resolution**2 * TEXEL_MEMORY,
+            'lower "map_resolution" or list fewer clusters',
+        )
+        baked = bake_maps(
+            scene,
+            radiance_distance,
+            [clusters[i] for i in chosen],
+            [members[i] for i in chosen],
+            resolution,
+            settings.map_samples,
+            seed=1,
+        )
+        maps |= zip(chosen, baked, strict=True)
+    return tuple(maps[i] for i in range(len(clusters)))
 
 
 @contextmanager

@@ -166,7 +166,7 @@ class _Object:
             if isinstance(value, mi.Object):
                 # Shapes of a group may all have the same name.
                 self.children.append((name, value))
-            elif dr.is_jit_v(value):
+            elif value is not None and dr.is_jit_v(value):
                 self.arrays[name] = type(value)(value)
             else:
                 self.values[name] = _plain(value)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import mitsuba as mi
+import numpy as np
 
 
 class Parameters:
@@ -67,6 +68,39 @@ class Parameters:
         if not isinstance(value, str):
             raise TypeError(f'{self.owner}: "{name}" must be a string, not {value!r}')
         return value
+
+    def names(self, name: str) -> tuple[str, ...]:
+        """Ids separated by commas; none if it isn't given."""
+        text = self.text(name)
+        found = tuple(part.strip() for part in text.split(",") if part.strip())
+        if name in self._props and not found:
+            raise ValueError(f'{self.owner}: "{name}" must list ids, not {text!r}')
+        return found
+
+    def point(self, name: str) -> tuple[float, ...] | None:
+        """Three finite numbers, or text that lists them; None if it isn't given."""
+        if name not in self._props:
+            return None
+        value = self._props.get(name)
+        try:
+            point = tuple(map(float, value.split(",") if isinstance(value, str) else value))
+        except (TypeError, ValueError):
+            point = ()
+        if len(point) != 3 or not all(map(math.isfinite, point)):
+            raise ValueError(f'{self.owner}: "{name}" must be three numbers, not {value!r}')
+        return point
+
+    def rotation(self, name: str) -> np.ndarray:
+        """Rotation, [3, 3], of a transform that may also mirror and scale evenly and move."""
+        value = self._props.get(name, mi.ScalarTransform4f())
+        matrix = np.array(getattr(value, "matrix", np.zeros((4, 4))), np.float64)[:3, :3]
+        turned = matrix / max(np.linalg.norm(matrix, axis=0).max(), 1e-30)
+        if not np.allclose(turned.T @ turned, np.eye(3), atol=1e-4):
+            shown = " ".join(f"{x:g}" for x in matrix.ravel()) if matrix.any() else repr(value)
+            raise ValueError(
+                f'{self.owner}: "{name}" must rotate, without stretching or shearing, not {shown}'
+            )
+        return turned
 
     def _in_range(self, name, value, low, high):
         if not (low <= value <= high and math.isfinite(value)):

@@ -1,7 +1,8 @@
 """Named arrays with metadata in multi-part OpenEXR files that any viewer opens.
 
 Each file ends with a digest of all that comes before it, which viewers ignore. Nothing is made of a
-file unless that is right: OpenEXR doesn't survive every damage.
+file of ours unless that is right: OpenEXR doesn't survive every damage. Pictures of other tools,
+which have no digest, are read as they are.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import math
 import os
 import re
 from collections.abc import Callable
@@ -31,8 +33,10 @@ _MAGIC = b"v/1\x01"
 _ATTRIBUTE_BYTES = re.compile(ATTRIBUTE.encode() + rb'\0string\0....\{"format": (\d+)', re.DOTALL)
 _HEADER = 1 << 16
 _DIGEST_SIZE = 16
-#: Deflate makes nothing smaller by more than this.
+#: Deflate, which ours are compressed by, makes nothing smaller by more than this.
 _COMPRESSION = 1032
+#: What OpenEXR and JSON raise at what they can't read.
+_NOT_PARSED = (RuntimeError, TypeError, ValueError, KeyError, AttributeError)
 
 Parts = dict[str, dict[str, np.ndarray]]
 
@@ -43,20 +47,41 @@ def write(path: str | os.PathLike, parts: Parts, metadata: dict) -> None:
     The file appears under its name only when it's complete. Raises ``StorageError`` if it can't be
     written.
     """
-    header = {
+    first = {ATTRIBUTE: json.dumps({"format": FORMAT, **metadata})}
+    with replacing(path) as file:
+        _exr(parts, {}, first).write(file)
+        file.seek(0)
+        file.write(_digest(file.read()))
+
+
+def write_pictures(path: str | os.PathLike, parts: Parts, header: dict) -> None:
+    """Likewise for other tools: parts that all have the OpenEXR attributes ``header``."""
+    with replacing(path) as file:
+        _exr(parts, header, {}).write(file)
+
+
+def _exr(parts: Parts, header: dict, first: dict) -> OpenEXR.File:
+    """A file of parts that all have one header, and the first some more."""
+    header = header | {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
         "displayWindow": _display_window(parts),
     }
-    first = {ATTRIBUTE: json.dumps({"format": FORMAT, **metadata})}
-    exr_parts = [  # Which change the dictionaries that they are given.
-        OpenEXR.Part(header | (first if i == 0 else {}), dict(channels), name=name)
-        for i, (name, channels) in enumerate(parts.items())
-    ]
-    with replacing(path) as file:
-        OpenEXR.File(exr_parts).write(file)
-        file.seek(0)
-        file.write(_digest(file.read()))
+    return OpenEXR.File(
+        [  # Which change the dictionaries that they are given.
+            OpenEXR.Part(header | (first if i == 0 else {}), dict(channels), name=name)
+            for i, (name, channels) in enumerate(parts.items())
+        ]
+    )
+
+
+def is_ours(path: str | os.PathLike) -> bool:
+    """Does a file begin as what ``write`` writes, in any format? False if it can't be read."""
+    try:
+        with open(str(path), "rb") as file:
+            return _ATTRIBUTE_BYTES.search(file.read(_HEADER)) is not None
+    except OSError:
+        return False
 
 
 def read(path: str | os.PathLike, made_by: str) -> Stored:
@@ -65,9 +90,32 @@ def read(path: str | os.PathLike, made_by: str) -> Stored:
     Raises ``StorageError`` if the file is missing, damaged, of another format or none of ours;
     ``made_by`` tells the user where such files come from.
     """
+    return _guarded(_read, path, made_by)
+
+
+def read_pictures(path: str | os.PathLike, made_by: str) -> list[Picture]:
+    """Read the parts of any OpenEXR file; raises ``StorageError`` if it's missing or damaged."""
+    return _guarded(_read_pictures, path, made_by)
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A part of an OpenEXR file.
+
+    name       of the part
+    header     its attributes
+    channels   name → [H, W] array
+    """
+
+    name: str
+    header: dict[str, Any]
+    channels: dict[str, np.ndarray]
+
+
+def _guarded(reader: Callable, path: str | os.PathLike, made_by: str) -> Any:
     path = Path(str(path))  # Mitsuba's own paths aren't os.PathLike.
     try:
-        return _read(path, made_by)
+        return reader(path, made_by)
     except MemoryError:
         raise StorageError(
             f"{path}: needs more memory than the {free_memory() / 1e9:.1f} GB that are free; close "
@@ -75,23 +123,35 @@ def read(path: str | os.PathLike, made_by: str) -> Stored:
         ) from None
 
 
-def _read(path: Path, made_by: str) -> Stored:
+def _content(path: Path, made_by: str) -> bytes:
     try:
         if not path.is_file():
             raise StorageError(f"{path}: no such file; {made_by}")
         _ask_for_memory(path.stat().st_size)
-        content = path.read_bytes()
+        return path.read_bytes()
     except OSError as error:
         reason = f"can't be read: {error.strerror}; fix that, or {made_by}"
         raise StorageError(f"{path}: {reason}") from error
+
+
+def _read(path: Path, made_by: str) -> Stored:
+    content = _content(path, made_by)
     fault = _fault(content)
     if fault:
         raise StorageError(f"{path}: {fault}; {made_by}")
     try:
         parts, metadata = _parse(content)
-    except (RuntimeError, TypeError, ValueError, KeyError, AttributeError) as error:
+    except _NOT_PARSED as error:
         raise StorageError(f"{path}: not as this version writes files; {made_by}") from error
     return Stored(parts, metadata, str(path), made_by)
+
+
+def _read_pictures(path: Path, made_by: str) -> list[Picture]:
+    content = _content(path, made_by)
+    try:
+        return _pictures(content)
+    except _NOT_PARSED as error:
+        raise StorageError(f"{path}: damaged or no OpenEXR file; {made_by}") from error
 
 
 @dataclass(frozen=True)
@@ -199,18 +259,25 @@ def _digest(content: bytes) -> bytes:
 
 
 def _parse(content: bytes) -> tuple[Parts, dict[str, Any]]:
+    pictures = _pictures(content, _COMPRESSION)
+    parts = {picture.name: picture.channels for picture in pictures}
+    return parts, dict(json.loads(pictures[0].header[ATTRIBUTE]))
+
+
+def _pictures(content: bytes, compression: float = math.inf) -> list[Picture]:
+    """The parts of a file that is smaller than its pixels by no more than ``compression``."""
     with OpenEXR.File(io.BytesIO(content), separate_channels=True, header_only=True) as file:
-        size = _claimed_size([part.header for part in file.parts])
-        if size > _COMPRESSION * len(content):
-            raise ValueError("sizes that can't be true")
-        _ask_for_memory(size)
-        metadata = json.loads(file.parts[0].header[ATTRIBUTE])
+        headers = [dict(part.header) for part in file.parts]
+    size = _claimed_size(headers)
+    if size > compression * len(content):
+        raise ValueError("sizes that can't be true")
+    _ask_for_memory(size)
     with OpenEXR.File(io.BytesIO(content), separate_channels=True) as file:
-        parts = {
-            part.name(): {name: channel.pixels for name, channel in part.channels.items()}
-            for part in file.parts
-        }
-    return parts, dict(metadata)
+        channels = [
+            {name: channel.pixels for name, channel in part.channels.items()} for part in file.parts
+        ]
+        names = [part.name() for part in file.parts]
+    return [Picture(*each) for each in zip(names, headers, channels, strict=True)]
 
 
 def _ask_for_memory(size: int) -> None:

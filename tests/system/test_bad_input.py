@@ -158,6 +158,8 @@ def test_damaged_files(saved, tmp_path, damage, message, reader):
     else:  # Mitsuba adds where the plugin was loaded.
         error = complaint(mi.load_dict, {"type": "mipmap_cube", "filename": str(path)})
         assert "mipmap_cube: " in error
+        # Pictures of other tools may be maps.
+        message = message.replace("not a file of envmap_integrator", "holds no cube map")
     assert str(path) in error and message in error and "envmap-render bake" in error
 
 

@@ -268,5 +268,5 @@ def test_advice(served, masked, words):
     loaded = mi.load_string(
         f'<scene version="3.0.0"> <integrator type="envmap_hybrid"> {text} </integrator> </scene>'
     ).integrator()
-    assert loaded.requests[0].shape_ids == ("ball & co",)
+    assert loaded.requests[0].shapes == ("ball & co",)
     assert loaded.requests[0].distance_ratio == 2

@@ -134,6 +134,17 @@ def listed(*shapes: str) -> Callable:
     return lambda _: listed_clusters(points, np.zeros(1), load(room()), (request,), 2.0)
 
 
+def plain_picture(shape: tuple[int, int]) -> Callable[[Surroundings], Path]:
+    """A picture of another tool."""
+
+    def make(s):
+        channels = {name: np.ones(shape, np.float32) for name in "RGB"}
+        storage.write_pictures(s.folder / "plain.exr", {"a": channels}, {})
+        return s.folder / "plain.exr"
+
+    return make
+
+
 def use(make: Callable[[Surroundings], Path]) -> Callable:
     """Prepare from the file that ``make`` leaves."""
     return lambda s: integrator("envmap_hybrid", cache_file=str(make(s)), **SETTINGS).prepare(
@@ -328,6 +339,11 @@ CASES = {
         lambda _: emitter(shapes="a", to_world=mi.ScalarTransform4f())(_),
         'mipmap_cube "sky"', '"to_world"', "remove it",
     ),
+    "rotation": Case(
+        lambda s: parameter("rotation", mi.ScalarTransform4f().scale([1, 2, 1]))(s),
+        '"ours": "x"', "1 0 0 0 2 0 0 0 1", "must rotate, without stretching",
+    ),
+    "point": Case(parameter("point", "1, 2"), '"ours": "x"', "'1, 2'", "must be three numbers"),
     "neither": Case(emitter(), 'mipmap_cube "sky"', "neither", 'give either "filename"'),
     "both": Case(
         emitter(shapes="a", filename=lambda s: s.state), '"sky"', "both", 'give either "filename"'
@@ -354,6 +370,14 @@ CASES = {
         'sensor "sensor"', "medium", "remove it or use volpath",
     ),
     "unknown shape": Case(listed("bal"), 'mipmap_cube "desk"', '"bal"', "optimize=False"),
+    "unknown exception": Case(
+        lambda _: integrator("envmap_hybrid", **SETTINGS, no_cluster="bal").prepare(load(room())),
+        'envmap_hybrid: "no_cluster"', '"bal"', "optimize=False",
+    ),
+    "listed and excluded": Case(
+        lambda _: integrator("envmap_hybrid", **SETTINGS, no_cluster="ball"),
+        '"no_cluster" names shape "ball"', 'mipmap_cube "desk"', "leave it out of one",
+    ),
     "listed twice": Case(listed("ball", "ball"), '"desk"', '"ball" is listed twice', "list it "),
     # ---- What else isn't done ----
     "frozen": Case(frozen, "envmap_hybrid", "dr.freeze", "render outside of the frozen function"),
@@ -425,6 +449,18 @@ CASES = {
         emitter(filename=altered(no_maps)), 'mipmap_cube "sky": {folder}/altered.exr',
         "holds no maps", 'set "maps" to "always"',
     ),
+    "a picture that is no cube": Case(
+        emitter(filename=plain_picture((6, 2))), 'mipmap_cube "sky": {folder}/plain.exr',
+        "holds no cube map", "of six square faces one above the other",
+    ),
+    "a cube map with a name": Case(
+        emitter(filename=plain_picture((12, 2)), map="sofa"), "{folder}/plain.exr", '"sofa"',
+        'leave "map" out',
+    ),
+    "no picture": Case(
+        emitter(filename=with_bytes(lambda b: b"text")), "altered.exr", "no OpenEXR file",
+        "make it with",
+    ),
     "map of another variant": Case(
         emitter(filename=altered(grey_map)),
         "mipmap_cube", "1 colour channels, variant llvm_ad_rgb needs 3", "bake it with this",
@@ -450,6 +486,10 @@ CASES = {
         xml('<bsdf version="3.0.0" type="plastic"/>'), "scene.xml", '"plastic"', "be a <scene>"
     ),
     "assignment": Case(lambda _: parse_assignment("a"), '"a"', '"a"', "expected KEY=VALUE"),
+    "no such child": Case(
+        shell(commands.bake, integrator="envmap_hybrid", set=[("desk.resolution", 8)]),
+        '"desk.resolution"', 'holds no "desk"', 'set "desk.shapes" too',
+    ),
     "spp": Case(shell(commands.render, spp=-1), "--spp", "-1", "must not be negative"),
     "threads": Case(shell(commands.render, threads=0), "--threads", "0", "must be at least 1"),
     "mode": Case(shell(commands.render, mode="gpu"), "variant", '"gpu"', "choose from"),

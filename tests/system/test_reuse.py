@@ -9,7 +9,20 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from tests.helpers import at, ball, cluster, grey, integrator, lamp, load, picture, room, scaled
+from envmap_integrator.preparation.maps.interchange import write_cube
+from tests.helpers import (
+    at,
+    ball,
+    cluster,
+    grey,
+    integrator,
+    lamp,
+    load,
+    open_scene,
+    picture,
+    room,
+    scaled,
+)
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -64,6 +77,17 @@ def test_an_integrator_tells_scenes_alike_apart(name):
     renderer = integrator("one_level_path", patches=256)
     for scene in (one, other, one):
         assert np.array_equal(picture(scene, renderer, spp=4), new_picture(scene))
+
+
+@pytest.mark.parametrize("change", ["to_world", "scale"])
+def test_a_turned_or_brighter_sky_is_another(change, tmp_path):
+    changes = {"to_world": mi.ScalarTransform4f().rotate([0, 0, 1], 90), "scale": 2.0}
+    write_cube(tmp_path / "sky.exr", [np.random.default_rng(4).random((24, 4, 3))])
+    sky = {"type": "mipmap_cube", "filename": str(tmp_path / "sky.exr")}
+    renderer = integrator("one_level_path", patches=256)
+    one, other = (load(open_scene(sky=sky | more)) for more in ({}, {change: changes[change]}))
+    assert renderer.prepare(one).key != renderer.prepare(other).key
+    assert renderer.prepare(load(open_scene(sky=sky))).key == renderer.prepare(one).key
 
 
 # ---------------------- Scenes that share ----------------------

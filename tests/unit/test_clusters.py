@@ -15,7 +15,9 @@ from envmap_integrator.preparation.maps.clusters import (
     cluster_of_cell,
     find_clusters,
     listed_clusters,
+    shapes_named,
 )
+from envmap_integrator.system.scene_order import ordered_shapes
 from tests.helpers import ball
 from tests.unit.kit import scene_of, surface_points
 
@@ -190,10 +192,44 @@ def test_a_listed_shape_without_surface_is_left_out(scene):
     assert (cluster_of_point == -1).all()
 
 
+def test_shapes_with_names_alike_are_shown_first():
+    parts = {name: ball(i, 0, 0, 0.1) for i, name in enumerate(("rug", "wall", "chair-leg", "b"))}
+    with pytest.raises(ValueError, match='"chair"; it has "chair-leg", "'):
+        shapes_named(scene_of(**parts), ("chair",), "ours")
+
+
 def test_long_lists_of_shapes_are_cut():
     scene = scene_of(*(ball(i, 0, 0, 0.1) for i in range(20)))
     with pytest.raises(ValueError, match=r'"shape7", … \(20 in all\)'):
         listed(scene, ClusterRequest("desk", ("cup",), None), points=floor())
+
+
+def test_a_centre_can_be_moved(scene):
+    """The cube still holds the cluster: it grows."""
+    asked = ClusterRequest("a", ("left",), 1.5, center=(-5.0, 0.0, 2.0))
+    (cluster,), _ = listed(scene, asked)
+    assert cluster.centre == pytest.approx((-5, 0, 2))
+    assert cluster.radius == pytest.approx(2, abs=0.05)
+    assert cluster.half_width == pytest.approx(1.5 * cluster.radius)
+
+
+def test_what_is_excluded_is_in_no_automatic_cluster():
+    points = hall()
+    clusters, cluster_of_point = find_clusters(
+        points, single_space(points), RATIO, points.object_id == 1
+    )
+    assert len(clusters) == 1
+    assert clusters[0].centre == pytest.approx(RIGHT, abs=0.05)
+    assert set(cluster_of_point[points.object_id == 1]) == {-1}
+
+
+def test_shapes_are_found_by_their_ids(scene):
+    ids = [shape.id() for shape in ordered_shapes(scene)]
+    named = shapes_named(scene, ("right", "left"), "ours")
+    assert [name for name, is_named in zip(ids, named, strict=True) if is_named] == [
+        name for name in ids if name in ("left", "right")
+    ]
+    assert not shapes_named(scene, (), "ours").any()
 
 
 # ---------------------- Cells of the coarse mesh ----------------------

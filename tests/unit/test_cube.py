@@ -246,3 +246,9 @@ def test_faces_are_those_of_double_precision(case):
     assert np.array_equal(face.numpy() % 2 == 1, major < 0)
     expected = np.stack([d[rows, (axis + k) % 3] for k in (1, 2)]) / np.abs(major)
     assert_allclose(uv.numpy(), expected, rtol=ROUNDINGS * EPSILON, atol=1e-37)
+
+
+def test_directions_of_texels_lead_back_to_them():
+    d = cube.texel_directions(4).reshape(-1, 3).T.astype(np.float32)
+    index = cube.texel(*cube.direction_to_face(mi.Vector3f(d)), mi.UInt32(4), mi.UInt32(4))
+    assert index.numpy().tolist() == list(range(6 * 16))

@@ -116,6 +116,34 @@ def test_a_constant_map_is_constant_whatever_the_look_up(random, corrected, inve
         assert trusted.all()
 
 
+def test_maps_may_differ_in_resolution():
+    """Each is read where it lies, at its own levels."""
+    maps = tuple(
+        CubeMap(
+            Cluster(f"cluster{value}", CENTRE, CUBE / 2, CUBE),
+            [
+                np.full((6, size >> i, size >> i, 4), (value + i, value, 0, 0), np.float32)
+                for i in range(n_levels(size))
+            ],
+        )
+        for value, size in ((10, 4), (20, 32), (30, 8))
+    )
+    field = far_field(scene_of(), maps, np.zeros(1, np.uint32), 1, 0.0, True, False)
+    for pdf, levels in ((1e9, (0, 0, 0)), (0, (2, 5, 3))):
+        radiance, _ = field.eval(
+            mi.UInt32([0, 1, 2]),
+            mi.Ray3f(mi.Point3f(CENTRE), mi.Vector3f(0.6, 0.0, [0.8, 0.8, -0.8])),
+            mi.Float(pdf),
+            mi.Bool(False),
+            mi.Float(0),
+            mi.Point2f(0.5),
+            mi.Bool([True] * 3),
+        )
+        expected = [10 + levels[0], 20 + levels[1], 30 + levels[2]]
+        assert radiance.numpy()[0].tolist() == expected
+        assert radiance.numpy()[1].tolist() == [10, 20, 30]
+
+
 def mean_level(field: FarField, o, d, **options) -> np.ndarray:
     """Expected level [N] over the random rounding."""
     rounds = (np.arange(256, dtype=np.float32) + 0.5) / 256

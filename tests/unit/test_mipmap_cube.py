@@ -15,10 +15,12 @@ from envmap_integrator.lookup.cube import (
     solid_angles,
 )
 from envmap_integrator.lookup.cube_map import Cluster, CubeMap, from_stored, to_parts
+from envmap_integrator.preparation.maps.clusters import ClusterRequest
 from envmap_integrator.preparation.maps.mipmap import build_levels
 from envmap_integrator.system.storage import read, write
 from tests.helpers import (
     assert_agree,
+    at,
     camera,
     cluster,
     exactly,
@@ -153,6 +155,22 @@ def test_there_are_no_seams(emitter, level):
             assert_allclose(sides[0], sides[1], atol=1e-3)
 
 
+def turned() -> mi.ScalarTransform4f:
+    """About an axis across all others."""
+    axis = dr.normalize(mi.ScalarVector3f(1, -2, 0.5))
+    return mi.ScalarTransform4f().rotate(axis, 70)
+
+
+def test_a_map_can_be_turned_and_scaled(emitter):
+    radiance, d = random_radiance(), directions(1000)
+    matrix = mi.Matrix3f(np.array(turned().matrix)[:3, :3])
+    expected = 0.25 * seen(emitter(radiance), d)
+    # Where it is and how large doesn't matter to what is infinitely far.
+    for to_world in (turned(), at(5, 0, 1) @ scaled(2) @ turned()):
+        ours = seen(emitter(radiance, to_world=to_world, scale=0.25), matrix @ d)
+        assert_allclose(ours, expected, rtol=2e-3)
+
+
 # ---------------------- Sampling ----------------------
 
 
@@ -218,9 +236,11 @@ def test_the_density_integrates_to_one(emitter):
     assert_agree(mean_of(values), exactly(1.0), precision=0.05)
 
 
-@pytest.mark.parametrize("level", [0.0, 1.0])
-def test_samples_agree_with_the_other_queries(emitter, level):
-    ours = emitter(random_radiance(sparse=True), level=level)
+@pytest.mark.parametrize("parameters", [{}, {"level": 1.0}, {"to_world": "turned", "scale": 3.0}])
+def test_samples_agree_with_the_other_queries(emitter, parameters):
+    if "to_world" in parameters:
+        parameters = parameters | {"to_world": turned()}
+    ours = emitter(random_radiance(sparse=True), **parameters)
     u = mi.Point2f(np.random.default_rng(12).uniform(size=(2, 100_000)).astype(np.float32))
     ds, weight = sampled(ours, u)
     assert_allclose(dr.norm(ds.d).numpy(), 1, rtol=1e-6)
@@ -279,8 +299,9 @@ def test_a_diffuse_ball_under_a_constant_map(tmp_path, ball_under):
 def test_a_plastic_ball_is_lit_as_by_mitsubas_own_environment(tmp_path, ball_under):
     radiance = random_radiance()
     emitter = {"type": "mipmap_cube", "filename": save(tmp_path / "m.exr", map_of(radiance))}
-    ours = measure(ball_under(emitter, PLASTIC), mi.load_dict(PATH), spp=256).overall()
-    theirs = ball_under(latitude_longitude(mi.load_dict(emitter)), PLASTIC)
+    moved = {"to_world": turned(), "scale": 2.0}
+    ours = measure(ball_under(emitter | moved, PLASTIC), mi.load_dict(PATH), spp=256).overall()
+    theirs = ball_under(latitude_longitude(mi.load_dict(emitter)) | moved, PLASTIC)
     reference = measure(theirs, mi.load_dict(PATH), spp=256).overall()
     assert_agree(ours, reference, allowed=0.005, precision=0.02)
 
@@ -334,6 +355,11 @@ def test_scenes_of_any_size_hide_and_see_the_map(tmp_path, scale):
         ({"filename": "map.exr", "level": -1.0}, '"level" must be at least 0, not -1.0'),
         ({"filename": "map.exr", "level": "fine"}, "\"level\" must be a number, not 'fine'"),
         ({"filename": "map.exr", "levels": 1.0}, "levels"),
+        ({"filename": "map.exr", "scale": -1.0}, '"scale" must be at least 0'),
+        ({"filename": "map.exr", "center": "0, 0, 0"}, "center"),
+        ({"shapes": "ball", "center": "0, 0"}, "\"center\" must be three numbers, not '0, 0'"),
+        ({"shapes": "ball", "resolution": 48}, '"resolution" must be a power of two, not 48'),
+        ({"shapes": "ball", "scale": 2.0}, "scale"),
         ({"filename": "map.exr", "distance_ratio": 2.0}, "distance_ratio"),
         ({"shapes": " , "}, "\"shapes\" must list ids, not ' , '"),
         ({"shapes": "ball", "distance_ratio": 0.5}, '"distance_ratio" must be at least 1'),
@@ -367,9 +393,12 @@ def test_a_cluster_at_scene_level_is_refused(kind):
 
 
 def test_a_cluster_keeps_its_shapes():
-    emitter = mi.load_dict({"type": "mipmap_cube", "id": "desk", "shapes": "table, ball ,"})
-    assert emitter.request.shape_ids == ("table", "ball")
-    assert emitter.request.distance_ratio is None
+    described = {"type": "mipmap_cube", "id": "desk", "shapes": "table, ball ,"}
+    assert mi.load_dict(described).request == ClusterRequest("desk", ("table", "ball"))
+    described |= {"distance_ratio": 3, "center": [0, 1, 0.5], "resolution": 8}
+    request = ClusterRequest("desk", ("table", "ball"), 3, (0, 1, 0.5), 8)
+    assert mi.load_dict(described).request == request
+    assert mi.load_dict(described | {"center": "0, 1, 0.5"}).request == request
 
 
 def test_sizes_of_the_file(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mitsuba as mi
+import numpy as np
 import pytest
 
 from envmap_integrator.system.parameters import Parameters
@@ -36,6 +37,17 @@ def test_values_are_returned_and_defaults_where_there_are_none(method, arguments
     assert getattr(parameters(), method)("x", *arguments) == default
 
 
+def test_names_points_and_rotations():
+    ours = parameters(ids=" a,b, ", p=[1, 2, 3], q="1, 2,3.5", turn=mi.ScalarTransform4f())
+    assert ours.names("ids") == ("a", "b")
+    assert ours.names("others") == ()
+    assert ours.point("p") == (1, 2, 3)
+    assert ours.point("q") == (1, 2, 3.5)
+    assert ours.point("r") is None
+    assert (ours.rotation("turn") == np.eye(3)).all()
+    assert (ours.rotation("other") == np.eye(3)).all()
+
+
 def test_numbers_are_floats():
     assert isinstance(parameters(x=2).number("x", 0.5, 0.0), float)
 
@@ -56,6 +68,11 @@ def test_numbers_are_floats():
         (TypeError, "flag", (False,), 1, "must be true or false, not 1"),
         (ValueError, "choice", ("a", ("a", "b")), "c", 'must be "a" or "b", not \'c\''),
         (TypeError, "text", (), 3, "must be a string, not 3"),
+        (ValueError, "names", (), ", ", "must list ids, not ', '"),
+        (ValueError, "point", (), "1, 2", "must be three numbers, not '1, 2'"),
+        (ValueError, "point", (), "1, 2, nan", "must be three numbers, not '1, 2, nan'"),
+        (ValueError, "point", (), 3, "must be three numbers, not 3"),
+        (ValueError, "rotation", (), 3, "must rotate, without stretching or shearing, not 3"),
     ],
 )
 def test_wrong_values_are_named(error, method, arguments, value, message):

@@ -15,7 +15,10 @@ from tests.readme import README, documented, plugins, updated
 pytestmark = pytest.mark.usefixtures("variant")
 
 NAMES = ["envmap_hybrid", "one_level_path", "source_selection", "envmap_bake", "mipmap_cube"]
-READERS = ("integer", "power_of_two", "number", "flag", "choice", "text")
+READERS = (
+    *("integer", "power_of_two", "number", "flag", "choice"),
+    *("text", "names", "point", "rotation"),
+)
 #: Uses of a plugin that read different parameters; those that aren't listed are loaded bare.
 USES = {"mipmap_cube": [{"shapes": "ball"}, {"filename": "none.exr"}]}
 #: Read by Mitsuba's base class of all integrators.
@@ -30,9 +33,9 @@ def parameters_read(monkeypatch):
     def spy(reader):
         original = getattr(Parameters, reader)
 
-        def ask(self, name, default="", *limits):
-            asked[self.owner.split()[0]][name] = default
-            return original(self, name, default, *limits)
+        def ask(self, name, *limits):
+            asked[self.owner.split()[0]][name] = limits[0] if limits else None
+            return original(self, name, *limits)
 
         monkeypatch.setattr(Parameters, reader, ask)
 

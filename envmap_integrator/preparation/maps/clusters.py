@@ -7,6 +7,7 @@ material, so one shape may be all the woodwork of a house.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from difflib import SequenceMatcher
 
 import drjit as dr
 import mitsuba as mi
@@ -36,11 +37,16 @@ LOOK_UP_COST = 0.12
 
 @dataclass(frozen=True)
 class ClusterRequest:
-    """A cluster listed by the user: a nested ``mipmap_cube`` with ``shapes``."""
+    """A cluster listed by the user: a nested ``mipmap_cube`` with ``shapes``.
+
+    What is None is left to the integrator, or to where the shapes are.
+    """
 
     name: str
-    shape_ids: tuple[str, ...]
-    distance_ratio: float | None
+    shapes: tuple[str, ...]
+    distance_ratio: float | None = None
+    center: tuple[float, ...] | None = None
+    resolution: int | None = None
 
 
 def listed_clusters(
@@ -58,42 +64,36 @@ def listed_clusters(
     the one where most is seen belongs to it.
     Raises ``ValueError`` if a shape isn't in the scene or is listed twice.
     """
-    ids = [shape.id() for shape in ordered_shapes(scene)]
     clusters = []
     cluster_of_point = np.full(len(points), -1)
-    listed = np.zeros(len(ids), dtype=bool)
+    listed: list[str] = []
     for request in requests:
         owner = f'mipmap_cube "{request.name}"'
-        members = np.zeros(len(ids), dtype=bool)
-        for shape_id in request.shape_ids:
-            if shape_id not in ids:
-                raise ValueError(
-                    f'{owner}: the scene has no shape "{shape_id}"; it has {_some(ids)} '
-                    "(Mitsuba merges meshes that share a material: load with optimize=False)"
-                )
-            shape = ids.index(shape_id)
-            if listed[shape]:
+        members = shapes_named(scene, request.shapes, owner)
+        for shape_id in request.shapes:
+            if shape_id in listed:
                 raise ValueError(f'{owner}: shape "{shape_id}" is listed twice; list it once')
-            listed[shape] = members[shape] = True
+            listed.append(shape_id)
         member = members[points.object_id]
         if not member.any():
             mi.Log(
                 mi.LogLevel.Warn,
                 f"{owner}: no surface that could use a map was found on "
-                f"{_some(request.shape_ids)}, so there is none; mirrors and glass are traced "
+                f"{_some(request.shapes)}, so there is none; mirrors and glass are traced "
                 'unless "mirrors" is "map"',
             )
             continue
         if (space[member] >= 0).any():
             member &= space == np.bincount(space[member & (space >= 0)]).argmax()
         ratio = request.distance_ratio or distance_ratio
-        cluster = _cluster(request.name, points.position[member], ratio)
+        cluster = _cluster(request.name, points.position[member], ratio, request.center)
         box = scene.bbox()  # The sensors may have seen a part of it only.
         if _holds(cluster, *points.box) and _holds(cluster, box.min, box.max):
             mi.Log(
                 mi.LogLevel.Warn,
                 f"{owner}: its cube holds the whole scene, so there is nothing to map; set a "
-                f'"distance_ratio" below {ratio:g}',
+                f'"distance_ratio" below {ratio:g}'
+                + (', or move its "center" to its shapes' if request.center else ""),
             )
             continue
         cluster_of_point[member] = len(clusters)
@@ -101,18 +101,40 @@ def listed_clusters(
     return clusters, cluster_of_point
 
 
+def shapes_named(scene: mi.Scene, names: tuple[str, ...], owner: str) -> np.ndarray:
+    """Which shapes of a scene, in their fixed order, have one of these ids, [S].
+
+    Raises ``ValueError``, in the name of ``owner``, if one isn't in the scene.
+    """
+    ids = [shape.id() for shape in ordered_shapes(scene)]
+    for name in names:
+        if name not in ids:
+            # Those first that are most alike.
+            known = sorted(ids, key=lambda id_: -SequenceMatcher(None, name, id_).ratio())
+            raise ValueError(
+                f'{owner}: the scene has no shape "{name}"; it has {_some(known)} '
+                "(Mitsuba merges meshes that share a material: load with optimize=False)"
+            )
+    return np.isin(ids, names)
+
+
 def find_clusters(
-    points: SurfacePoints, space: np.ndarray, distance_ratio: float
+    points: SurfacePoints,
+    space: np.ndarray,
+    distance_ratio: float,
+    excluded: np.ndarray | bool = False,
 ) -> tuple[list[Cluster], np.ndarray]:
     """Group the contents of each space, as far as the scene's sensors see them, into clusters.
 
+    Points that are ``excluded`` [N] belong to none.
     Returns the clusters and the cluster of every surface point [N], -1 if it belongs to none.
     """
     cluster_of_point = np.full(len(points), -1)
     if not points.seen.any():
         return [], cluster_of_point
     extent = points.extent
-    contents = np.flatnonzero((space >= 0) & ~_on_large_plane(points, extent))
+    surroundings = _on_large_plane(points, extent) | excluded
+    contents = np.flatnonzero((space >= 0) & ~surroundings)
     if len(contents) == 0:
         return [], cluster_of_point
 
@@ -211,10 +233,16 @@ def _joined(columns) -> np.ndarray:
     return key
 
 
-def _cluster(name: str, position: np.ndarray, distance_ratio: float) -> Cluster:
+def _cluster(
+    name: str,
+    position: np.ndarray,
+    distance_ratio: float,
+    center: tuple[float, ...] | None = None,
+) -> Cluster:
     low, high = position.min(axis=0), position.max(axis=0)
-    radius = max(float((high - low).max()) / 2, 1e-30)
-    return Cluster(name, (low + high) / 2, radius, distance_ratio * radius)
+    centre = (low + high) / 2 if center is None else np.array(center)
+    radius = max(float(np.maximum(high - centre, centre - low).max()), 1e-30)
+    return Cluster(name, centre, radius, distance_ratio * radius)
 
 
 def _holds(cluster: Cluster, low, high) -> bool:

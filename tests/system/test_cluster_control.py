@@ -1,0 +1,126 @@
+"""Clusters by hand, where the automatic choice fails: what is asked for is what is made."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import pytest
+
+from envmap_integrator.cli.scene_file import SceneFile
+from tests.helpers import cluster, integrator, load, picture, room
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+SMALL = {"patches": 512, "map_resolution": 16}
+CENTER = (0.4, 0.2, -1.5)
+
+
+@pytest.fixture(scope="module")
+def scene(variant) -> mi.Scene:
+    return load(room())
+
+
+def clusters(**ball: object) -> dict:
+    return {"one": cluster("block"), "two": cluster("ball") | ball}
+
+
+def test_each_cluster_has_its_own_settings(scene):
+    ours = clusters(resolution=8, center=list(CENTER), distance_ratio=2.5)
+    one, two = integrator("envmap_hybrid", **SMALL, **ours).prepare(scene).maps
+    assert (one.resolution, two.resolution) == (16, 8)
+    assert two.cluster.centre == pytest.approx(CENTER)
+    assert two.cluster.half_width == pytest.approx(2.5 * two.cluster.radius)
+
+
+def test_maps_of_several_resolutions_are_baked_and_read_alike(scene):
+    """Those of one cluster don't depend on what the other asks for."""
+    even, mixed = (
+        integrator("envmap_hybrid", **SMALL, **clusters(**changes))
+        for changes in ({}, {"resolution": 64})
+    )
+    first, _ = even.prepare(scene).maps
+    same, finer = mixed.prepare(scene).maps
+    assert (finer.resolution, same.resolution) == (64, 16)
+    # Other bake rays: the mean is the same.
+    assert same.levels[-1].mean() == pytest.approx(first.levels[-1].mean(), rel=0.03)
+    means = [picture(scene, ours, spp=64).mean() for ours in (even, mixed)]
+    assert means[1] == pytest.approx(means[0], rel=0.02)
+
+
+def test_what_is_excluded_is_left_out_of_automatic_clusters(scene):
+    """Block and ball lie side by side, in one cluster; the lamp is another."""
+    found = []
+    for names in ("lamp", "lamp, ball", "lamp, ball, block"):
+        ours = integrator("envmap_hybrid", **SMALL, distance_ratio=1.2, no_cluster=names)
+        found.append([cube_map.cluster for cube_map in ours.prepare(scene).maps])
+    (both,), (block,), none = found
+    assert both.radius > 0.6 and none == []
+    assert block.radius == pytest.approx(0.4, abs=0.02)
+    assert block.centre == pytest.approx((-0.5, 0.6, -1.5), abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("changes", "difference"),
+    [
+        ({"two": {"resolution": 8}}, "made with two.resolution=None, not two.resolution=8"),
+        ({"two": {"center": [0, 0, 0]}}, r"not two.center=\[0.0, 0.0, 0.0\]"),
+        ({"two": {"distance_ratio": 3}}, "two.distance_ratio=1.5, not two.distance_ratio=3"),
+        ({"two": {"shapes": "lamp"}}, r"made with two.shapes=\['ball'\], not two.shapes="),
+        ({"no_cluster": "lamp"}, r"made with no_cluster=\[\], not no_cluster=\['lamp'\]"),
+        ({"three": cluster("lamp")}, "made with three.name=None, not three.name='three'"),
+    ],
+)
+def test_a_state_for_other_clusters_is_refused(scene, tmp_path_factory, changes, difference):
+    path = tmp_path_factory.getbasetemp() / "clusters.exr"
+    if not path.is_file():
+        integrator("envmap_hybrid", **SMALL, **clusters()).prepare(scene).save(path)
+    asked = clusters(**changes.get("two", {})) | {k: v for k, v in changes.items() if k != "two"}
+    reader = integrator("envmap_hybrid", **SMALL, **asked, cache_file=str(path))
+    with pytest.raises(ValueError, match=difference):
+        reader.prepare(scene)
+
+
+# ---------------------- From the shell ----------------------
+
+XML = """<scene version="3.0.0"> <sensor type="perspective"/> <bsdf type="diffuse" id="grey"/>
+    <integrator type="envmap_hybrid"> {nested} </integrator>
+    <shape type="rectangle" id="left"> <ref id="grey"/> </shape>
+    <shape type="rectangle" id="right"> <ref id="grey"/> </shape>
+    <emitter type="constant"/> </scene>"""
+DESK = """<emitter type="mipmap_cube" id="desk"> <string name="shapes" value="left"/>
+    <integer name="resolution" value="8"/> </emitter>"""
+
+
+def scene_file(folder, nested: str = "", **settings: object) -> SceneFile:
+    path = folder / "scene.xml"
+    path.write_text(XML.format(nested=nested))
+    described = SceneFile(path)
+    described.configure_integrator(settings={k.replace("__", "."): v for k, v in settings.items()})
+    return described
+
+
+def test_a_cluster_is_made_by_its_shapes(tmp_path):
+    described = scene_file(
+        tmp_path, desk__center="0, 0, 1", desk__resolution=32, desk__shapes="left, right"
+    )
+    loaded = described.load()
+    (request,) = loaded.integrator().requests
+    assert (request.name, request.shapes) == ("desk", ("left", "right"))
+    assert (request.center, request.resolution) == ((0, 0, 1), 32)
+    assert {"left", "right"} <= {shape.id() for shape in loaded.shapes()}
+
+
+def test_settings_of_a_cluster_in_the_scene_are_changed(tmp_path):
+    described = scene_file(tmp_path, DESK, desk__distance_ratio=3.0)
+    (request,) = described.load().integrator().requests
+    assert (request.shapes, request.resolution, request.distance_ratio) == (("left",), 8, 3)
+
+
+def test_shapes_that_are_excluded_keep_their_ids(tmp_path):
+    loaded = scene_file(tmp_path, no_cluster="right").load()
+    assert loaded.integrator().no_cluster == ("right",)
+    assert {"left", "right"} <= {shape.id() for shape in loaded.shapes()}
+
+
+def test_a_child_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(ValueError, match='holds no "tabel", only desk; set "tabel.shapes" too'):
+        scene_file(tmp_path, DESK, tabel__resolution=8)
