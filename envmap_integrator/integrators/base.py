@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
+import os
 import time
 from collections.abc import Iterator
 
 import drjit as dr
 import mitsuba as mi
+
+import envmap_integrator
 
 from ..imaging.film import (
     INDIRECT_AOVS,
@@ -21,6 +25,7 @@ from ..imaging.film import (
     put_plain,
     rgb,
 )
+from ..imaging.progress_file import Progress, planned_samples, progress_of, stored_progress
 from ..imaging.progressive import Improving, improve
 from ..lookup.far_field import FarField
 from ..lookup.lookup import Lookup
@@ -121,13 +126,15 @@ class CachedIntegrator(mi.SamplingIntegrator):
 
     def to_string(self) -> str:
         """Its parameters, for messages and the metadata of pictures."""
-        parameters = {
+        listed = ",\n".join(f"  {name} = {value}" for name, value in self._parameters().items())
+        return f"{type(self).__name__}[\n{listed}\n]"
+
+    def _parameters(self) -> dict[str, object]:
+        return {
             name: value
             for name, value in vars(self).items()
             if not name.startswith("_") and name != "owner"
         }
-        listed = ",\n".join(f"  {name} = {value}" for name, value in parameters.items())
-        return f"{type(self).__name__}[\n{listed}\n]"
 
     # ---------------------- Preparation ----------------------
 
@@ -242,14 +249,22 @@ class CachedIntegrator(mi.SamplingIntegrator):
         total: int = 256,
         seconds: float = math.inf,
         target_error: float = 0.0,
+        progress_file: str | os.PathLike | None = None,
+        resume: bool = False,
     ) -> Iterator[Improving]:
         """Render a sensor in passes of ``spp`` samples per pixel.
 
         It ends after ``total`` samples, after so many ``seconds``, pre-passes included, or when the
         noise that is left has a relMSE of ``target_error``. After 1, 2, 3, 4, 6, 8, 12 … passes,
         and the last, comes a picture of all so far; the film has it too. The pre-passes are those
-        for ``total`` samples. Raises ``ValueError`` as ``prepare`` does, and if ``sampler`` isn't
-        ``coherent``.
+        for ``total`` samples.
+
+        ``progress_file`` keeps what has been rendered, from every picture and from Ctrl-C on. With
+        ``resume`` it goes on from there, to the same bits as if it hadn't ended. If ``total`` is
+        another one then, the pre-passes remain those for the first.
+
+        Raises ``ValueError`` as ``prepare`` does, if ``sampler`` isn't ``coherent``, and for a
+        ``progress_file`` that is missing, damaged, or of another scene, sensor or setting.
         """
         deadline = time.perf_counter() + seconds
         if self.sampler != "coherent":
@@ -258,13 +273,17 @@ class CachedIntegrator(mi.SamplingIntegrator):
             )
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
-        baked = self.prepare(scene, sensor, total)
-        lookup = self._lookup(scene, baked, total)
+        size = sensor.film().crop_size()
+        stored = stored_progress(progress_file) if resume else None
+        planned = planned_samples(stored) if stored else total
+        baked = self.prepare(scene, sensor, planned)
+        lookup = self._lookup(scene, baked, planned)
+        made_for = self._made_with(sensor, baked, seed, spp)
+        progress = progress_of(stored, made_for, size) if stored else Progress.none(planned)
 
-        def send(stream, index):
+        def send(stream, first, n):
             seed_ = 2 * seed + stream & 0xFFFFFFFF
-            shade = self._shade(scene, lookup, seed_)
-            return self.sums(sensor, None, spp, seed_, shade, first=index * spp)
+            return self.sums(sensor, None, n, seed_, self._shade(scene, lookup, seed_), first)
 
         def develop(sums, n_samples):
             self.put(sensor, sums, n_samples)
@@ -272,7 +291,28 @@ class CachedIntegrator(mi.SamplingIntegrator):
             dr.eval(picture)
             return picture
 
-        return improve(send, develop, spp, total, deadline, target_error)
+        def keep():
+            if progress_file is not None:
+                progress.save(progress_file, made_for, size)
+
+        return improve(
+            send, develop, keep, progress, spp, total, deadline, target_error, state=baked
+        )
+
+    def _made_with(self, sensor, baked: BakedState, seed: int, spp: int) -> dict[str, object]:
+        """All that the passes of a picture depend on."""
+        return {
+            "version": envmap_integrator.__version__,
+            "variant": mi.variant(),
+            "scene": baked.key.scene,
+            "film": " ".join(str(sensor.film()).split()),
+            "sensor": view_name(sensor),
+            "integrator": type(self).__name__,
+            **{name: " ".join(str(value).split()) for name, value in self._parameters().items()},
+            "seed": seed,
+            "spp": spp,
+            "cache": hashlib.blake2b(baked.cache.table.numpy(), digest_size=16).hexdigest(),
+        }
 
     def _shade(self, scene, lookup: Lookup, seed: int) -> Shade:
         rules = self.rules(seed)

@@ -37,14 +37,14 @@ _COMPRESSION = 1032
 Parts = dict[str, dict[str, np.ndarray]]
 
 
-def write(path: str | os.PathLike, parts: Parts, metadata: dict) -> None:
+def write(path: str | os.PathLike, parts: Parts, metadata: dict, compress: bool = True) -> None:
     """Write parts (name → channel → [H, W] array of float32 or uint32) and metadata.
 
     The file appears under its name only when it's complete. Raises ``StorageError`` if it can't be
     written.
     """
     header = {
-        "compression": OpenEXR.ZIP_COMPRESSION,
+        "compression": OpenEXR.ZIP_COMPRESSION if compress else OpenEXR.NO_COMPRESSION,
         "type": OpenEXR.scanlineimage,
         "displayWindow": _display_window(parts),
     }
