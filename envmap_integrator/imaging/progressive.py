@@ -12,6 +12,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.ndimage import rank_filter
 
 from ..system.interrupt import interruptible
 from .film import Sums
@@ -19,6 +20,9 @@ from .progress_file import Progress, Stream
 
 #: Part of a picture's mean radiance, squared, that relMSE adds to the denominator.
 DARK = 0.01
+#: Of a pixel [H, W, C].
+_NEIGHBOURS = np.ones((3, 3, 1), bool)
+_NEIGHBOURS[1, 1] = False
 
 
 @dataclass(frozen=True)
@@ -118,9 +122,14 @@ def _picture(streams: list[Stream], develop) -> tuple[mi.TensorXf, float]:
 
 
 def _rel_mse(one: np.ndarray, other: np.ndarray, mean: np.ndarray) -> float:
-    """Of the difference of two pictures [H, W, C], by their radiance."""
+    """Of the difference of two pictures [H, W, C], by their radiance.
+
+    A single bright sample mustn't hide its own error behind the brightness that it makes: a pixel
+    counts as no brighter than the second of its neighbours.
+    """
     one, other, mean = (picture[:, :, :3].astype(np.float64) for picture in (one, other, mean))
-    square = np.square(one - other) / (np.square(mean) + DARK * mean.mean() ** 2)
+    scale = np.minimum(mean, rank_filter(mean, -2, footprint=_NEIGHBOURS))
+    square = np.square(one - other) / (np.square(scale) + DARK * mean.mean() ** 2)
     return float(square.mean())
 
 
