@@ -130,10 +130,10 @@ def _progress(better: Improving, elapsed: float, args: argparse.Namespace, total
     if args.target_error and math.isfinite(better.error):
         left.append(better.pace * better.spp * (better.error / args.target_error - 1))
     noise = f"noise {better.error:.1e}" if math.isfinite(better.error) else "noise unknown"
-    return (
-        f"{better.spp} samples per pixel, {noise}, {elapsed:.1f} s; "
-        f"about {0 if better.is_last else max(min(left), 0):.0f} s left"
-    )
+    time_left = f"about {0 if better.is_last else max(min(left), 0):.0f} s left"
+    if not (better.pace or better.is_last):
+        time_left = "kept from before"
+    return f"{better.spp} samples per pixel, {noise}, {elapsed:.1f} s; {time_left}"
 
 
 def _write(args, output, bitmap, settings, seconds, compilation, more) -> None:

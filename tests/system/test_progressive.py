@@ -238,7 +238,11 @@ def test_a_run_that_was_ended_goes_on(tmp_path, capsys):
     assert run("--progressive", "--spp", 52, "-o", whole) == 0
     assert run("--progressive", "--spp", 52, "--time", 1e-3, "-o", parts) == 0
     assert json.loads(header(parts)["settings"])["spp"] == 16
+    capsys.readouterr()
     assert run("--resume", "--spp", 52, "-o", parts) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if "samples per pixel" in line]
+    assert [line.split()[0] for line in lines] == ["16", "32", "48", "52"]
+    assert lines[0].endswith("; kept from before") and lines[-1].endswith("; about 0 s left")
     pictures = [np.array(mi.Bitmap(str(path))) for path in (whole, parts)]
     assert np.array_equal(*pictures)
     for name in ("settings", "noise_error", "cache_error"):
