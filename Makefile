@@ -14,7 +14,7 @@ SUDO   := $(if $(filter 0,$(shell id -u)),,sudo)
 # Debian's and Ubuntu's names, best first. LLVM 16 and older make Dr.Jit abort.
 LLVM_PACKAGES := libllvm19 libllvm20 libllvm21 libllvm18 libllvm17 libllvm17t64
 
-.PHONY: render test lint clean
+.PHONY: render test docs lint clean
 .DELETE_ON_ERROR:
 
 render: $(LLVM)
@@ -22,6 +22,12 @@ render: $(LLVM)
 
 test: $(LLVM)
 	$(BIN)/python -m pytest
+
+# The tutorial with its pictures, and pages of the interface in renders/api.
+docs: $(LLVM)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]'
+	$(BIN)/python -m nbconvert --to notebook --execute --inplace envmap_integrator/docs/tutorial.ipynb
+	$(BIN)/python -m tests.api renders/api
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -15,6 +15,7 @@ from compare.experiments import (
     complexity,
     distance,
     error_vs_time,
+    flicker,
     gallery,
     render,
     resolution,
@@ -30,6 +31,7 @@ EXPERIMENTS: dict[str, ModuleType] = {
     "error-vs-time": error_vs_time,
     "complexity": complexity,
     "bias": bias,
+    "flicker": flicker,
     "gallery": gallery,
     "render": render,
 }

@@ -71,6 +71,7 @@ RENDER_EXAMPLES = """examples:
   envmap-render render room.xml --spp 16 --denoise --png       # a look
   envmap-render render room.xml --integrator envmap_hybrid --spp 256 -o room.exr
   envmap-render render room.xml --progressive --time 30 --png  # better and better
+  envmap-render render room.xml --resume --time 30 --png       # goes on from there
   envmap-render render room.xml --target-error 1e-3
   envmap-render render room.xml --set residual_probability=0.5 # without bias, more noise
   envmap-render render room.xml -D resx=320 -s 1               # smaller, second sensor
@@ -141,6 +142,9 @@ def build_parser() -> argparse.ArgumentParser:
     render.add_argument("--time", type=float, metavar="SECONDS", help="end after so long")
     render.add_argument(
         "--target-error", type=float, metavar="RELMSE", help="end when so little noise is left"
+    )
+    render.add_argument(
+        "--resume", action="store_true", help="go on from what --progressive has kept beside OUTPUT"
     )
     render.set_defaults(command=commands.render)
 

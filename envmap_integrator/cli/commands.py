@@ -50,7 +50,8 @@ def render(args: argparse.Namespace) -> int:
 
 def _improves(args: argparse.Namespace) -> bool:
     """Are pictures asked for that get better?"""
-    return args.progressive or args.time is not None or args.target_error is not None
+    ends = args.time is not None or args.target_error is not None
+    return args.progressive or args.resume or ends
 
 
 def _render_at_once(args, scene, sensor, settings, seconds, more) -> mi.Bitmap:
@@ -95,27 +96,28 @@ def _improve(args, scene, sensor, settings, seconds, more, output) -> mi.Bitmap:
     asked = args.time is not None or args.target_error is not None
     total = args.spp or (MOST if asked else settings["spp"])
     begin = time.perf_counter()
+    keeps = args.progressive or args.resume
     pictures = integrator.progressive(
         scene,
         sensor,
         args.seed,
-        min(PASS, total),
+        PASS,
         total,
         seconds=args.time or math.inf,
         target_error=args.target_error or 0.0,
+        progress_file=output.with_suffix(".progress.exr") if keeps else None,
+        resume=args.resume,
     )
-    state = integrator.prepare(scene, sensor, total)
-    seconds |= state.stage_times
-    more["cache_error"] = state.relative_error
-    prepared = sum(state.stage_times.values())
     for better in pictures:
         elapsed = time.perf_counter() - begin
-        seconds["render"] = elapsed - prepared
+        seconds |= better.state.stage_times
+        seconds["render"] = elapsed - sum(better.state.stage_times.values())
+        more["cache_error"] = better.state.relative_error
         settings["spp"] = better.spp
         if math.isfinite(better.error):
             more["noise_error"] = better.error
         bitmap = sensor.film().bitmap()
-        if args.progressive:
+        if args.progressive and not better.is_last:
             _write(args, output, bitmap, settings, seconds, 0.0, more)
         if not (args.quiet or args.json):
             print(_progress(better, elapsed, args, total), flush=True)
@@ -124,16 +126,16 @@ def _improve(args, scene, sensor, settings, seconds, more, output) -> mi.Bitmap:
 
 def _progress(better: Improving, elapsed: float, args: argparse.Namespace, total: int) -> str:
     """What there is so far, and how long it may take."""
-    left = [elapsed * (total / better.spp - 1)]
+    left = [better.pace * (total - better.spp)]
     if args.time:
         left.append(args.time - elapsed)
     if args.target_error and math.isfinite(better.error):
-        left.append(elapsed * (better.error / args.target_error - 1))
+        left.append(better.pace * better.spp * (better.error / args.target_error - 1))
     noise = f"noise {better.error:.1e}" if math.isfinite(better.error) else "noise unknown"
-    return (
-        f"{better.spp} samples per pixel, {noise}, {elapsed:.1f} s; "
-        f"about {max(min(left), 0):.0f} s left"
-    )
+    time_left = f"about {0 if better.is_last else max(min(left), 0):.0f} s left"
+    if not (better.pace or better.is_last):
+        time_left = "kept from before"
+    return f"{better.spp} samples per pixel, {noise}, {elapsed:.1f} s; {time_left}"
 
 
 def _write(args, output, bitmap, settings, seconds, compilation, more) -> None:

@@ -7,16 +7,22 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from operator import add
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.ndimage import rank_filter
 
 from ..system.interrupt import interruptible
 from .film import Sums
+from .progress_file import Progress, Stream
 
 #: Part of a picture's mean radiance, squared, that relMSE adds to the denominator.
 DARK = 0.01
+#: Of a pixel [H, W, C].
+_NEIGHBOURS = np.ones((3, 3, 1), bool)
+_NEIGHBOURS[1, 1] = False
 
 
 @dataclass(frozen=True)
@@ -27,71 +33,103 @@ class Improving:
     spp       samples per pixel
     error     relMSE by the noise that is left in its radiance, infinite after a single pass; what
               cache and maps get wrong isn't part of it
+    pace      seconds that a sample of all pixels takes, 0 if there is nothing to do
+    is_last   whether no other comes
+    state     the ``BakedState`` that it's rendered with
     """
 
     picture: mi.TensorXf
     spp: int
     error: float
+    pace: float
+    is_last: bool
+    state: Any
 
 
 def improve(
-    send: Callable[[int, int], Sums],
+    send: Callable[[int, int, int], Sums],
     develop: Callable[[Sums, int], mi.TensorXf],
+    keep: Callable[[], None],
+    progress: Progress,
     spp: int,
     total: int,
     deadline: float,
     target: float,
+    state: Any,
 ) -> Iterator[Improving]:
     """Render passes of ``spp`` samples per pixel, and give a picture when it's worth it.
 
-    ``send(stream, index)`` renders pass ``index`` of one of two streams, which are independent of
-    each other: how much their pictures differ tells the noise of both together. Within each, passes
-    are well stratified together. ``develop(sums, n_samples)`` makes a picture and uses the list up.
+    ``send(stream, first, n)`` renders ``n`` samples, from the ``first`` on, of one of two streams,
+    which are independent of each other: how much their pictures differ tells the noise of both
+    together. Within each, passes are well stratified together. ``develop(sums, n_samples)`` makes a
+    picture and uses the list up. ``progress`` is what there is so far, and is brought up to date;
+    ``keep()`` is called for every picture, and on Ctrl-C.
+
     It ends after ``total`` samples per pixel, if another pass would take longer than to the
     ``deadline`` of ``time.perf_counter``, or with an error of at most ``target``.
     """
-    streams: list[Sums | None] = [None, None]
-    counts = [0, 0]
-    n_passes, begin, last = 0, time.perf_counter(), False
-    enough = math.inf
-    while not last:
-        stream = n_passes % 2
-        with interruptible(), dr.suspend_grad():
-            found = send(stream, counts[stream])
-            so_far = streams[stream]
-            streams[stream] = found if so_far is None else [*map(add, so_far, found)]
-            dr.eval(streams[stream])
-        counts[stream] += 1
-        n_passes += 1
-        now = time.perf_counter()
-        last = n_passes * spp >= total or now + (now - begin) / n_passes > deadline
-        if last or _worth_it(n_passes) or n_passes >= enough:
-            with interruptible(), dr.suspend_grad():
-                improving = _picture(streams, counts, develop, spp)
-            last |= improving.error <= target
-            yield improving
-            if target > 0:  # Noise falls as the number of passes grows.
-                enough = n_passes * improving.error / target
+    begin, n_before = time.perf_counter(), progress.samples
+    pace, enough = 0.0, math.inf
+    due, last = n_before > 0, n_before >= total  # What there is already is shown at once.
+    try:
+        while True:
+            if due:
+                with interruptible(), dr.suspend_grad():
+                    picture, error = _picture(progress.streams, develop)
+                last |= error <= target
+                keep()
+                yield Improving(picture, progress.samples, error, pace, last, state)
+                if target > 0:  # Noise falls as the number of samples grows.
+                    enough = progress.samples * error / target
+            if last:
+                return
+            _pass(send, progress, spp, total)
+            now = time.perf_counter()
+            pace = (now - begin) / (progress.samples - n_before)
+            last = progress.samples >= total or now + pace * spp > deadline
+            due = last or _worth_it(-(-progress.samples // spp)) or progress.samples >= enough
+    except KeyboardInterrupt:
+        if progress.samples:
+            keep()
+        raise
 
 
-def _picture(streams, counts, develop, spp) -> Improving:
-    n = sum(counts)
-    if n == 1:
-        return Improving(develop(list(streams[0]), spp), spp, math.inf)
-    one, other = (
-        np.array(develop(list(sums), count * spp))
-        for sums, count in zip(streams, counts, strict=True)
-    )
-    picture = develop([*map(add, *streams)], n * spp)
-    # A mean over passes has the variance of one, over their number.
-    part = counts[0] * counts[1] / n**2
-    return Improving(picture, n * spp, part * _rel_mse(one, other, np.array(picture)))
+def _pass(send, progress: Progress, spp: int, total: int) -> None:
+    """The next pass of the stream that has fewer samples; one that was cut short is filled up."""
+    one, other = progress.streams
+    index = int(other.samples < one.samples)
+    so_far = progress.streams[index]
+    n = min(spp - so_far.samples % spp, total - progress.samples)
+    with interruptible(), dr.suspend_grad():
+        sums = send(index, so_far.samples, n)
+        if so_far.samples:
+            sums = [*map(add, so_far.sums, sums)]
+        dr.eval(sums)
+    # At once: Ctrl-C may come between any two steps.
+    progress.streams[index] = Stream(sums, so_far.samples + n)
+
+
+def _picture(streams: list[Stream], develop) -> tuple[mi.TensorXf, float]:
+    """The picture of both streams, and its error."""
+    (one, n_one), (other, n_other) = ((stream.sums, stream.samples) for stream in streams)
+    if n_other == 0:
+        return develop(list(one), n_one), math.inf
+    first, second = np.array(develop(list(one), n_one)), np.array(develop(list(other), n_other))
+    picture = develop([*map(add, one, other)], n_one + n_other)
+    # A mean over samples has the variance of one, over their number.
+    part = n_one * n_other / (n_one + n_other) ** 2
+    return picture, part * _rel_mse(first, second, np.array(picture))
 
 
 def _rel_mse(one: np.ndarray, other: np.ndarray, mean: np.ndarray) -> float:
-    """Of the difference of two pictures [H, W, C], by their radiance."""
+    """Of the difference of two pictures [H, W, C], by their radiance.
+
+    A single bright sample mustn't hide its own error behind the brightness that it makes: a pixel
+    counts as no brighter than the second of its neighbours.
+    """
     one, other, mean = (picture[:, :, :3].astype(np.float64) for picture in (one, other, mean))
-    square = np.square(one - other) / (np.square(mean) + DARK * mean.mean() ** 2)
+    scale = np.minimum(mean, rank_filter(mean, -2, footprint=_NEIGHBOURS))
+    square = np.square(one - other) / (np.square(scale) + DARK * mean.mean() ** 2)
     return float(square.mean())
 
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
+import os
 import time
 from collections.abc import Iterator
 
 import drjit as dr
 import mitsuba as mi
+
+import envmap_integrator
 
 from ..imaging.aovs import Aov, camera_sample, parse_aovs
 from ..imaging.film import (
@@ -21,6 +25,7 @@ from ..imaging.film import (
     put_gathered,
     put_plain,
 )
+from ..imaging.progress_file import Progress, planned_samples, progress_of, stored_progress
 from ..imaging.progressive import Improving, improve
 from ..lookup.far_field import FarField
 from ..lookup.lookup import Lookup
@@ -79,7 +84,6 @@ class CachedIntegrator(mi.SamplingIntegrator):
         self._made_for: tuple[StateKey, str] | None = None
         self._prepared: dict[tuple[Settings, str], BakedState] = {}
         self._recorders: list[Recorder] = []
-        self._recorder = Recorder()
         self._passes = 0
 
     # ---------------------- To be overridden ----------------------
@@ -117,11 +121,11 @@ class CachedIntegrator(mi.SamplingIntegrator):
         spp: int,
         seed: int,
         shading: Shading,
+        recorder: Recorder,
         first: int = 0,
     ) -> Sums:
         """Sums over samples of each pixel, as ``imaging.film`` has them."""
-        n_aovs, recorder = len(self.aov_names()), self._recorder
-        values = self.aov_values
+        n_aovs, values = len(self.aov_names()), self.aov_values
         return plain_sums(sensor, sampler, spp, seed, shading, recorder, n_aovs, values, first)
 
     def put(self, sensor: mi.Sensor, sums: Sums, spp: int) -> None:
@@ -130,13 +134,15 @@ class CachedIntegrator(mi.SamplingIntegrator):
 
     def to_string(self) -> str:
         """Its parameters, for messages and the metadata of pictures."""
-        parameters = {
+        listed = ",\n".join(f"  {name} = {value}" for name, value in self._parameters().items())
+        return f"{type(self).__name__}[\n{listed}\n]"
+
+    def _parameters(self) -> dict[str, object]:
+        return {
             name: value
             for name, value in vars(self).items()
             if not name.startswith("_") and name != "owner"
         }
-        listed = ",\n".join(f"  {name} = {value}" for name, value in parameters.items())
-        return f"{type(self).__name__}[\n{listed}\n]"
 
     # ---------------------- Preparation ----------------------
 
@@ -238,9 +244,9 @@ class CachedIntegrator(mi.SamplingIntegrator):
         film = sensor.film()
         with interruptible(), dr.suspend_grad():
             sampler, spp = self._pixel_sampler(sensor, spp)
-            lookup = self._lookup(scene, now, baked, spp)
+            lookup, recorder = self._lookup(scene, now, baked, spp)
             shading = Shading(scene, lookup, self.rules(seed), self.sample_aovs())
-            self.put(sensor, self.sums(sensor, sampler, spp, seed, shading), spp)
+            self.put(sensor, self.sums(sensor, sampler, spp, seed, shading, recorder), spp)
             picture = film.develop() if develop else mi.TensorXf()
             if evaluate:
                 film.schedule_storage()
@@ -256,14 +262,22 @@ class CachedIntegrator(mi.SamplingIntegrator):
         total: int = 256,
         seconds: float = math.inf,
         target_error: float = 0.0,
+        progress_file: str | os.PathLike | None = None,
+        resume: bool = False,
     ) -> Iterator[Improving]:
         """Render a sensor in passes of ``spp`` samples per pixel.
 
         It ends after ``total`` samples, after so many ``seconds``, pre-passes included, or when the
         noise that is left has a relMSE of ``target_error``. After 1, 2, 3, 4, 6, 8, 12 … passes,
         and the last, comes a picture of all so far; the film has it too. The pre-passes are those
-        for ``total`` samples. Raises ``ValueError`` as ``prepare`` does, and if ``sampler`` isn't
-        ``coherent``.
+        for ``total`` samples.
+
+        ``progress_file`` keeps what has been rendered, from every picture and from Ctrl-C on. With
+        ``resume`` it goes on from there, to the same bits as if it hadn't ended. If ``total`` is
+        another one then, the pre-passes remain those for the first.
+
+        Raises ``ValueError`` as ``prepare`` does, if ``sampler`` isn't ``coherent``, and for a
+        ``progress_file`` that is missing, damaged, or of another scene, sensor or setting.
         """
         deadline = time.perf_counter() + seconds
         if self.sampler != "coherent":
@@ -272,12 +286,18 @@ class CachedIntegrator(mi.SamplingIntegrator):
             )
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
-        lookup = self._lookup(scene, *self._ready(scene, sensor, total), total)
+        size = sensor.film().crop_size()
+        stored = stored_progress(progress_file) if resume else None
+        planned = planned_samples(stored) if stored else total
+        now, baked = self._ready(scene, sensor, planned)
+        lookup, recorder = self._lookup(scene, now, baked, planned)
+        made_for = self._made_with(sensor, baked, seed, spp)
+        progress = progress_of(stored, made_for, size) if stored else Progress.none(planned)
 
-        def send(stream, index):
+        def send(stream, first, n):
             seed_ = 2 * seed + stream & 0xFFFFFFFF
             shading = Shading(scene, lookup, self.rules(seed_), self.sample_aovs())
-            return self.sums(sensor, None, spp, seed_, shading, first=index * spp)
+            return self.sums(sensor, None, n, seed_, shading, recorder, first)
 
         def develop(sums, n_samples):
             self.put(sensor, sums, n_samples)
@@ -285,12 +305,35 @@ class CachedIntegrator(mi.SamplingIntegrator):
             dr.eval(picture)
             return picture
 
-        return improve(send, develop, spp, total, deadline, target_error)
+        def keep():
+            if progress_file is not None:
+                progress.save(progress_file, made_for, size)
 
-    def _lookup(self, scene, now: SceneState, baked: BakedState, spp: int) -> Lookup:
+        return improve(
+            send, develop, keep, progress, spp, total, deadline, target_error, state=baked
+        )
+
+    def _made_with(self, sensor, baked: BakedState, seed: int, spp: int) -> dict[str, object]:
+        """All that the passes of a picture depend on."""
+        return {
+            "version": envmap_integrator.__version__,
+            "variant": mi.variant(),
+            "scene": baked.key.scene,
+            "film": " ".join(str(sensor.film()).split()),
+            "sensor": view_name(sensor),
+            "integrator": type(self).__name__,
+            **{name: " ".join(str(value).split()) for name, value in self._parameters().items()},
+            "seed": seed,
+            "spp": spp,
+            "cache": hashlib.blake2b(baked.cache.table.numpy(), digest_size=16).hexdigest(),
+        }
+
+    def _lookup(
+        self, scene, now: SceneState, baked: BakedState, spp: int
+    ) -> tuple[Lookup, Recorder]:
+        """What paths look up, and what is recorded of renders that do."""
         maps = self.maps_for(scene, now, baked, spp)
-        self._recorder = self._recorder_of(now, baked, maps)
-        return now.lookup(baked, maps)
+        return now.lookup(baked, maps), self._recorder_of(now, baked, maps)
 
     def _recorder_of(self, now: SceneState, baked: BakedState, maps: FarField | None) -> Recorder:
         """The same one as long as nothing in the scene has been replaced."""
@@ -350,7 +393,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
                 f"{self.owner}: within another integrator only sensors of the scene are known, and "
                 "there are none; add the sensor to the scene"
             )
-        lookup = self._lookup(scene, *self._ready(scene, None, 0), sampler.sample_count())
+        lookup, _ = self._lookup(scene, *self._ready(scene, None, 0), sampler.sample_count())
         self._passes += 1
         rules = self.rules(self._passes)
         ray, active = mi.Ray3f(ray), mi.Bool(active)
@@ -390,10 +433,10 @@ class GatheringIntegrator(CachedIntegrator):
             clamp=dr.opaque(mi.Float, self.clamp_indirect) if self.clamp_indirect else None,
         )
 
-    def sums(self, sensor, sampler, spp, seed, shading, first=0) -> Sums:
+    def sums(self, sensor, sampler, spp, seed, shading, recorder, first=0) -> Sums:
         if not (self._shares() or self.indirect_aovs):
-            return super().sums(sensor, sampler, spp, seed, shading, first)
-        return gathered_sums(sensor, sampler, spp, seed, shading, self._recorder, first)
+            return super().sums(sensor, sampler, spp, seed, shading, recorder, first)
+        return gathered_sums(sensor, sampler, spp, seed, shading, recorder, first)
 
     def put(self, sensor, sums, spp) -> None:
         if not (self._shares() or self.indirect_aovs):

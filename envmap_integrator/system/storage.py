@@ -41,15 +41,16 @@ _NOT_PARSED = (RuntimeError, TypeError, ValueError, KeyError, AttributeError)
 Parts = dict[str, dict[str, np.ndarray]]
 
 
-def write(path: str | os.PathLike, parts: Parts, metadata: dict) -> None:
+def write(path: str | os.PathLike, parts: Parts, metadata: dict, compress: bool = True) -> None:
     """Write parts (name → channel → [H, W] array of float32 or uint32) and metadata.
 
     The file appears under its name only when it's complete. Raises ``StorageError`` if it can't be
     written.
     """
+    compression = OpenEXR.ZIP_COMPRESSION if compress else OpenEXR.NO_COMPRESSION
     first = {ATTRIBUTE: json.dumps({"format": FORMAT, **metadata})}
     with replacing(path) as file:
-        _exr(parts, {}, first).write(file)
+        _exr(parts, {"compression": compression}, first).write(file)
         file.seek(0)
         file.write(_digest(file.read()))
 
@@ -57,13 +58,12 @@ def write(path: str | os.PathLike, parts: Parts, metadata: dict) -> None:
 def write_pictures(path: str | os.PathLike, parts: Parts, header: dict) -> None:
     """Likewise for other tools: parts that all have the OpenEXR attributes ``header``."""
     with replacing(path) as file:
-        _exr(parts, header, {}).write(file)
+        _exr(parts, {"compression": OpenEXR.ZIP_COMPRESSION} | header, {}).write(file)
 
 
 def _exr(parts: Parts, header: dict, first: dict) -> OpenEXR.File:
     """A file of parts that all have one header, and the first some more."""
     header = header | {
-        "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
         "displayWindow": _display_window(parts),
     }

@@ -79,7 +79,7 @@ def test_values_are_those_that_are_stored(scene):
     ours = integrator("one_level_path", patches=512, aovs=ALL)
     found = channels(scene, ours, close)
     state = ours.prepare(scene, close, 4)
-    lookup = ours._lookup(scene, *ours._ready(scene, close, 4), 4)
+    lookup, _ = ours._lookup(scene, *ours._ready(scene, close, 4), 4)
     ray, si = centres(scene, close)
     vertex = Vertex.met(lookup, si, ray, mi.Bool(True))
     patch = lookup.patches.find(vertex.si.p, vertex.normal, vertex.object_id, vertex.cell)

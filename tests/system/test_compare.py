@@ -11,7 +11,7 @@ import pytest
 from compare import report, variants
 from compare.__main__ import EXPERIMENTS, main
 from compare.contributions import Ledger
-from compare.experiments import error_vs_time, render
+from compare.experiments import error_vs_time, flicker, render
 from compare.options import JudgedOptions
 from compare.references import Reference, reference
 from compare.runs import Task, interleave
@@ -40,6 +40,7 @@ TINY = {
         "resolutions": (8, 16),
     },
     "bias": {"spp": 4, "patches": 256, "finer": 4},
+    "flicker": {"spp": 4, "frames": 3, "degrees": 1.0},
     "render": {"spp": 4},
 }
 
@@ -185,6 +186,24 @@ def test_shares_of_known_errors():
         assert one.share.value == pytest.approx(share, abs=0.005)
         assert one.mean_bias.value == pytest.approx(mean, abs=0.002)
     assert sum(one.share.value for one in found) == pytest.approx(1)
+
+
+def test_flicker_of_known_errors():
+    """Noise of references and errors that stay count for nothing; those that change count."""
+    rng = np.random.default_rng(1)
+    truth = np.linspace(1, 2, 20)[:, None, None, None] * np.ones((20, 64, 80, 3))
+
+    def noisy(size):
+        return truth * (1 + size * rng.standard_normal(truth.shape))
+
+    references = noisy(0.2), noisy(0.2)
+    errors, changes = flicker.flicker(1.1 * truth, references)
+    assert errors.mean() == pytest.approx(0.1**2 / 1.01, rel=0.1)
+    assert changes.mean() == pytest.approx(0, abs=1e-4)
+    # In averages of 64 pixels; a difference of two has twice the variance.
+    errors, changes = flicker.flicker(noisy(0.8), references)
+    assert errors.mean() == pytest.approx(0.8**2 / 64, rel=0.1)
+    assert changes.mean() == pytest.approx(2 * 0.8**2 / 64, rel=0.1)
 
 
 def test_replaced_approximations_are_put_back():

@@ -206,6 +206,25 @@ def progressive_by_another_sampler(_: Surroundings) -> None:
     integrator("one_level_path", sampler="independent").progressive(load(room()))
 
 
+def resumed(change: Callable[[dict, dict], object], seed: int = 0) -> Callable:
+    """Go on from a progress file of which ``change`` has altered something."""
+
+    def action(s):
+        path = s.folder / "room.progress.exr"
+        ours, described = integrator("one_level_path", patches=64, sampler="coherent"), load(room())
+        list(ours.progressive(described, spp=1, total=1, progress_file=path))
+        stored = storage.read(path, "")
+        change(stored.parts, stored.metadata)
+        storage.write(path, stored.parts, stored.metadata)
+        ours.progressive(described, seed=seed, progress_file=path, resume=True, spp=1)
+
+    return action
+
+
+def half_sum(parts: dict, metadata: dict) -> None:
+    parts["stream0"] = {name: image[:12].copy() for name, image in parts["stream0"].items()}
+
+
 def hide(s: Surroundings) -> Path:
     path = s.public / "state.exr"
     path.write_bytes(s.state.read_bytes())
@@ -233,7 +252,7 @@ def fill_the_disk(s: Surroundings) -> None:
 def command_line(**options: object) -> argparse.Namespace:
     defaults = {"mode": "llvm_ad_rgb", "threads": None, "define": [], "set": [], "debug": False}
     defaults |= {"integrator": None, "sensor": 0, "spp": 1, "seed": 0, "png": False}
-    defaults |= {"progressive": False, "time": None, "target_error": None}
+    defaults |= {"progressive": False, "time": None, "target_error": None, "resume": False}
     defaults |= {"quiet": True, "json": False}
     return argparse.Namespace(**defaults | {"denoise": False} | options)
 
@@ -464,6 +483,13 @@ CASES = {
     "map of another variant": Case(
         emitter(filename=altered(grey_map)),
         "mipmap_cube", "1 colour channels, variant llvm_ad_rgb needs 3", "bake it with this",
+    ),
+    "progress of another seed": Case(
+        resumed(lambda parts, metadata: None, seed=1),
+        "{folder}/room.progress.exr", "seed=0, not seed=1", "begin anew, without resume",
+    ),
+    "progress of another size": Case(
+        resumed(half_sum), "room.progress.exr", "aren't 32 x 24", "begin anew, without resume"
     ),
     # ---- Files that are written ----
     "no folder": Case(

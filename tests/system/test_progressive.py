@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
-import itertools
 import json
+import signal
+import subprocess
+import sys
 import time
 
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from compare.metrics import rel_mse_of_difference
 from envmap_integrator.cli import main
-from tests.helpers import SCENES, camera, integrator, load, load_scene, open_scene, picture, room
+from tests.helpers import (
+    ROOT,
+    SCENES,
+    camera,
+    integrator,
+    load,
+    load_scene,
+    open_scene,
+    picture,
+    room,
+)
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -80,9 +91,11 @@ def test_the_error_is_true(name):
     """The noise of pictures of other seeds, that is: relMSE from their mean."""
     scene, plugin = SCENES_OF[name](), ours()
     found = [last(plugin.progressive(scene, 0, seed, 8, 64)) for seed in range(6)]
-    pairs = itertools.combinations(map(array, found), 2)
-    # Of a difference, half is the error of one.
-    true = np.mean([rel_mse_of_difference(*pair) for pair in pairs]) / 2
+    pictures = np.stack([array(improving) for improving in found]).astype(np.float64)
+    # By the mean of the others, which knows nothing of the bright samples of one.
+    others = (pictures.sum(axis=0) - pictures) / (len(pictures) - 1)
+    scale = others**2 + 0.01 * pictures.mean() ** 2
+    true = np.mean((pictures - others) ** 2 / scale) * (1 - 1 / len(pictures))
     stated = np.mean([improving.error for improving in found])
     assert stated == pytest.approx(true, rel=0.3)
 
@@ -117,6 +130,93 @@ def test_no_bias_with_residuals(scene):
     assert array(end).mean() == pytest.approx(reference.mean(), rel=0.01)
 
 
+# ---------------------- Going on later ----------------------
+
+
+def same(one, other) -> bool:
+    return (
+        one.spp == other.spp
+        and one.error == other.error
+        and np.array_equal(*map(array, (one, other)))
+    )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_goes_on_to_the_bit(scene, kind, tmp_path):
+    """By another integrator, of a scene that is loaded anew, as in a new process."""
+    file = tmp_path / "room.progress.exr"
+    whole = last(ours(kind).progressive(scene, spp=8, total=44))
+    for improving in ours(kind).progressive(scene, spp=8, total=44, progress_file=file):
+        if improving.spp == 24:
+            break
+    again = load(room(sensor=camera(64, 48)))
+    rest = list(ours(kind).progressive(again, spp=8, total=44, progress_file=file, resume=True))
+    assert [improving.spp for improving in rest] == [24, 32, 44]
+    assert same(rest[-1], whole)
+    (done,) = ours(kind).progressive(again, spp=8, total=44, progress_file=file, resume=True)
+    assert same(done, whole)
+
+
+def test_ctrl_c_loses_no_pass(scene, tmp_path, monkeypatch):
+    """After five of eight passes: between pictures, and within a pass."""
+    file, plugin = tmp_path / "room.progress.exr", ours()
+    whole = last(plugin.progressive(scene, spp=8, total=64))
+    send, passes = plugin.sums, []
+
+    def interrupted(*arguments, **more):
+        sums = send(*arguments, **more)
+        passes.append(sums)
+        if len(passes) == 6:
+            raise KeyboardInterrupt
+        return sums
+
+    monkeypatch.setattr(plugin, "sums", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        last(plugin.progressive(scene, spp=8, total=64, progress_file=file))
+    monkeypatch.undo()
+    rest = list(plugin.progressive(scene, spp=8, total=64, progress_file=file, resume=True))
+    assert [improving.spp for improving in rest] == [40, 48, 64]
+    assert same(rest[-1], whole)
+
+
+def test_more_samples_than_planned(scene, tmp_path):
+    """They share the strata, also where a pass was cut short, and the cache of the first run."""
+    file, plugin = tmp_path / "room.progress.exr", ours()
+    first = last(plugin.progressive(scene, spp=16, total=20, progress_file=file))
+    more = last(plugin.progressive(scene, spp=16, total=64, progress_file=file, resume=True))
+    assert (first.spp, more.spp) == (20, 64)
+    assert more.state is first.state
+    at_once = last(plugin.progressive(scene, spp=16, total=64))
+    # The same samples, but for the noise of strata in those of the pass that was cut short.
+    assert more.error == pytest.approx(at_once.error, rel=0.3)
+
+
+def other_room(**changes):
+    return load(room(**{"sensor": camera(64, 48)} | changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "settings", "seed", "reason"),
+    [
+        (lambda: {"ball": None}, {}, 0, "made for another scene: it has other shapes"),
+        (lambda: {"sensor": camera(64, 48, target=(0, 0.6, -1))}, {}, 0, "made for another sensor"),
+        (lambda: {"sensor": camera(32, 24)}, {}, 0, "made with film="),
+        (dict, {"shadow_samples": 4}, 0, "made with shadow_samples=2, not shadow_samples=4"),
+        (dict, {"patches": 1024}, 0, "made with patches=2048, not patches=1024"),
+        (dict, {}, 1, "made with seed=0, not seed=1"),
+    ],
+)
+def test_it_goes_on_with_nothing_else(scene, tmp_path, changes, settings, seed, reason):
+    file = tmp_path / "room.progress.exr"
+    last(ours().progressive(scene, spp=8, total=8, progress_file=file))
+    other, plugin = other_room(**changes()), ours(**settings)
+    with pytest.raises(ValueError, match=reason) as caught:
+        plugin.progressive(other, 0, seed, 8, 8, progress_file=file, resume=True)
+    message = str(caught.value)
+    assert message.startswith(f"{file}: ") and message.endswith("; begin anew, without resume")
+    assert "\n" not in message
+
+
 # ---------------------- Command line ----------------------
 
 
@@ -130,6 +230,52 @@ def test_path_cannot_go_on(tmp_path, capsys):
     scene, output = str(SCENES / "furnace.xml"), str(tmp_path / "furnace.exr")
     assert main(["render", scene, "--integrator", "path", "--time", "1", "-o", output]) == 2
     assert "pass --integrator envmap_hybrid" in capsys.readouterr().err
+
+
+def test_a_run_that_was_ended_goes_on(tmp_path, capsys):
+    """Three runs give the file of one; the number of samples asked for is met."""
+    whole, parts = tmp_path / "whole.exr", tmp_path / "parts.exr"
+    assert run("--progressive", "--spp", 52, "-o", whole) == 0
+    assert run("--progressive", "--spp", 52, "--time", 1e-3, "-o", parts) == 0
+    assert json.loads(header(parts)["settings"])["spp"] == 16
+    capsys.readouterr()
+    assert run("--resume", "--spp", 52, "-o", parts) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if "samples per pixel" in line]
+    assert [line.split()[0] for line in lines] == ["16", "32", "48", "52"]
+    assert lines[0].endswith("; kept from before") and lines[-1].endswith("; about 0 s left")
+    pictures = [np.array(mi.Bitmap(str(path))) for path in (whole, parts)]
+    assert np.array_equal(*pictures)
+    for name in ("settings", "noise_error", "cache_error"):
+        one, other = (header(path)[name] for path in (whole, parts))
+        assert one == other
+    capsys.readouterr()
+    assert run("--resume", "--spp", 52, "--seed", 1, "-o", parts) == 2
+    error = capsys.readouterr().err
+    assert "parts.progress.exr: made with seed=0, not seed=1" in error and error.count("\n") == 1
+    assert run("--resume", "-o", tmp_path / "none.exr") == 2
+    assert "none.progress.exr: no such file; begin anew" in capsys.readouterr().err
+
+
+def test_ctrl_c_in_the_shell(tmp_path):
+    """What has been rendered is kept, and the picture is that of an uninterrupted run."""
+    whole, parts = tmp_path / "whole.exr", tmp_path / "parts.exr"
+    options = ("--progressive", "--spp", 192, "-o")
+    program = (
+        "import sys; from tests.system.test_progressive import run; sys.exit(run(*sys.argv[1:]))"
+    )
+    command = [sys.executable, "-uc", program, *map(str, options), str(parts)]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    for line in process.stdout:
+        if line.startswith("64 samples"):  # The next picture is that of 96.
+            break
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=60)
+    assert process.returncode == 130
+    kept = parts.with_suffix(".progress.exr")
+    assert set(tmp_path.iterdir()) == {parts, kept}
+    assert run("--resume", *options, parts) == 0
+    assert run(*options, whole) == 0
+    assert np.array_equal(*(np.array(mi.Bitmap(str(path))) for path in (whole, parts)))
 
 
 def header(path) -> dict:

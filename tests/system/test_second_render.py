@@ -82,6 +82,16 @@ def test_passes_of_a_picture_that_gets_better_are_recorded_once(recordings):
     assert recordings() == 1
 
 
+def test_renders_between_passes_change_nothing():
+    """Of the same scene, with a coarser cache."""
+    scene, renderer = load(room()), new(patches=None)
+    alone = new(patches=None).progressive(load(room()), spp=4, total=512)
+    disturbed = renderer.progressive(scene, spp=4, total=512)
+    for _ in range(2):
+        assert np.array_equal(next(disturbed).picture, next(alone).picture)
+        mi.render(scene, integrator=renderer, spp=4)
+
+
 # ---------------------- What is recorded anew ----------------------
 
 
