@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from operator import add
 
 import drjit as dr
 import mitsuba as mi
 
 from ..system.interrupt import not_interrupted
-from ..system.jit import give_back
+from ..system.jit import LANES_ALIKE, give_back
 from ..system.progress import stage
 from ..transport.camera import CameraSample
 from ..transport.gathered import Gathered
@@ -24,8 +24,20 @@ INDIRECT_AOVS = tuple(f"{name}.{c}" for name in ("indirect", "gathered", "albedo
 #: most, which is Dr.Jit's limit.
 MIN_LANES, MAX_LANES = 1 << 20, (1 << 32) - 1
 
-#: What finds the light of a sample: takes a sampler, the ray, and the index of the sample.
+#: What finds the light of a sample: takes a sampler, the ray, the index of the sample in its pixel,
+#: and the pixel.
 Shade = Callable[..., CameraSample]
+
+
+def pixel_ranges(n_pixels: int, sizes: Iterable[int]) -> list[range]:
+    """The pixels of a film in ranges of about these sizes, which may be rendered apart."""
+    ranges, begin = [], 0
+    for size in sizes:
+        end = min(begin + -(-size // LANES_ALIKE) * LANES_ALIKE, n_pixels)
+        if end > begin:
+            ranges.append(range(begin, end))
+        begin = end
+    return ranges
 
 
 def most_samples(sensor: mi.Sensor) -> int:
@@ -46,19 +58,22 @@ def plain_sums(
     n_aovs: int,
     aovs: Callable[[CameraSample], list[mi.Float]],
     first: int = 0,
+    pixels: range | None = None,
 ) -> Sums:
     """Render ``spp`` samples per pixel of a sensor.
 
     ``sampler`` is one of Mitsuba's, or None for our own sample points, from the ``first`` on.
-    ``shade(sampler, ray, index)`` gives the ``CameraSample`` of the sample of that index, and
-    ``aovs`` the ``n_aovs`` values of it that are to go to channels of their own.
+    ``shade(sampler, ray, index, pixel)`` gives the ``CameraSample`` of the sample of that index,
+    and ``aovs`` the ``n_aovs`` values of it that are to go to channels of their own. With our own
+    sample points, only some ``pixels`` may be asked for, as ``pixel_ranges`` gives them: their sums
+    are those that all have, to the bit.
     """
 
     def channels(found, weight):
         shown = _shown(sensor.film(), found.radiance, found.valid, weight)
         return [*shown, *(weight * value for value in aovs(found))]
 
-    return _accumulate(sensor, sampler, spp, seed, shade, channels, n_aovs, first)
+    return _accumulate(sensor, sampler, spp, seed, shade, channels, n_aovs, first, pixels)
 
 
 def put_plain(sensor: mi.Sensor, sums: Sums, names: list[str]) -> None:
@@ -74,6 +89,7 @@ def gathered_sums(
     seed: int,
     shade: Shade,
     first: int = 0,
+    pixels: range | None = None,
 ) -> Sums:
     """As ``plain_sums``, with what surfaces gather taken apart."""
 
@@ -82,7 +98,8 @@ def gathered_sums(
         shown = _shown(sensor.film(), apart, found.valid, weight)
         return [*shown, *found.gathered.channels()]
 
-    return _accumulate(sensor, sampler, spp, seed, shade, channels, Gathered.count(), first)
+    n_guides = Gathered.count()
+    return _accumulate(sensor, sampler, spp, seed, shade, channels, n_guides, first, pixels)
 
 
 def put_gathered(sensor: mi.Sensor, sums: Sums, n_shared: int, with_aovs: bool) -> None:
@@ -122,7 +139,7 @@ def _put(sensor: mi.Sensor, sums: Sums) -> None:
     film.put_block(mi.ImageBlock(tensor, film.crop_offset()))
 
 
-def _accumulate(sensor, sampler, spp, seed, shade, channels, n_further, first) -> Sums:
+def _accumulate(sensor, sampler, spp, seed, shade, channels, n_further, first, pixels) -> Sums:
     """Sums over the samples of each pixel, row by row, of ``channels(found, weight)``."""
     film = sensor.film()
     pixel_filter = PixelFilter(film.rfilter())
@@ -131,12 +148,18 @@ def _accumulate(sensor, sampler, spp, seed, shade, channels, n_further, first) -
 
     def values(sampler, pixel, index):
         position = mi.Vector2i(pixel % width, pixel // width) + corner
-        return channels(*_sample(sensor, pixel_filter, sampler, shade, position, index))
+
+        def shade_pixel(sampler, ray):
+            return shade(sampler, ray, index, pixel)
+
+        return channels(*_sample(sensor, pixel_filter, sampler, shade_pixel, position))
 
     with stage("Rendering"):
         n_channels = len(_shown(film, mi.Spectrum(0), mi.Bool(True), mi.Float(1))) + n_further
         if sampler is None:
-            sums = _lane_per_pixel(values, n_pixels, spp, seed, n_channels, first)
+            parts = min(-(-MIN_LANES // n_pixels), spp)
+            pixels = pixels or range(n_pixels)
+            sums = _lane_per_pixel(values, pixels, parts, spp, seed, n_channels, first)
         else:
             sums = _lane_per_sample(values, n_pixels, spp, seed, n_channels, sampler)
         dr.eval(sums)
@@ -144,24 +167,29 @@ def _accumulate(sensor, sampler, spp, seed, shade, channels, n_further, first) -
     return sums
 
 
-def _lane_per_pixel(values, n_pixels, spp, seed, n_channels, start):
-    """A lane takes the samples of one pixel in turn, or a part of them where pixels are few.
+def _lane_per_pixel(values, pixels, parts, spp, seed, n_channels, start):
+    """A lane takes the samples of one pixel in turn, or one of ``parts`` where pixels are few.
 
-    Nothing is stored for a sample, and neighbouring lanes are neighbouring pixels.
+    Nothing is stored for a sample, and neighbouring lanes are neighbouring pixels: the same ones,
+    whichever range of pixels is rendered, since what rays hit that are traced together might hang
+    on each other in the last bit.
     """
-    parts = min(-(-MIN_LANES // n_pixels), spp)
-    lane, n_pixels_ = dr.arange(mi.UInt32, n_pixels * parts), dr.opaque(mi.UInt32, n_pixels)
-    pixel, part = lane % n_pixels_, lane // n_pixels_
+    n_pixels = len(pixels)
+    row = n_pixels if parts == 1 else -(-n_pixels // LANES_ALIKE) * LANES_ALIKE
+    lane, row_ = dr.arange(mi.UInt32, row * parts), dr.opaque(mi.UInt32, row)
+    place, part = lane % row_, lane // row_
+    pixel = place + dr.opaque(mi.UInt32, pixels.start)
     least, longer = (dr.opaque(mi.UInt32, n) for n in divmod(spp, parts))
     first = dr.opaque(mi.UInt32, start) + part * least + dr.minimum(part, longer)
     end = first + least + dr.select(part < longer, mi.UInt32(1), 0)
-    sums = [dr.zeros(mi.Float, n_pixels * parts) for _ in range(n_channels)]
+    end = dr.select(place < dr.opaque(mi.UInt32, n_pixels), end, first)
+    sums = [dr.zeros(mi.Float, row * parts) for _ in range(n_channels)]
     sums = _sums(values, SamplePoints.of(seed, pixel, spp, first), pixel, end, sums)
     if parts == 1:
         return sums
     dr.eval(sums)
-    parts_ = dr.opaque(mi.UInt32, parts)
-    lanes_of_pixel = lane % parts_ * n_pixels_ + lane // parts_
+    lane, parts_ = dr.arange(mi.UInt32, n_pixels * parts), dr.opaque(mi.UInt32, parts)
+    lanes_of_pixel = lane % parts_ * row_ + lane // parts_
     return [dr.block_sum(dr.gather(mi.Float, s, lanes_of_pixel), parts) for s in sums]
 
 
@@ -197,7 +225,7 @@ def _lane_per_sample(values, n_pixels, spp, seed, n_channels, sampler):
     return sums
 
 
-def _sample(sensor, pixel_filter, sampler, shade, position, index):
+def _sample(sensor, pixel_filter, sampler, shade, position):
     """The ``CameraSample`` of one sample of each pixel, weighted, and its weight in the pixel."""
     film = sensor.film()
     offset, filter_weight = pixel_filter.sample(sampler.next_2d())
@@ -208,7 +236,7 @@ def _sample(sensor, pixel_filter, sampler, shade, position, index):
     if sensor.shutter_open_time() > 0:
         time += sampler.next_1d() * sensor.shutter_open_time()
     ray, weight = sensor.sample_ray_differential(time, 0, within, aperture)
-    found = shade(sampler, mi.Ray3f(ray), index)
+    found = shade(sampler, mi.Ray3f(ray))
     return found.scaled(weight * filter_weight), filter_weight
 
 

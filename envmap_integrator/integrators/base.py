@@ -110,10 +110,11 @@ class CachedIntegrator(mi.SamplingIntegrator):
         seed: int,
         shade: Shade,
         first: int = 0,
+        pixels: range | None = None,
     ) -> Sums:
-        """Sums over samples of each pixel, as ``imaging.film`` has them."""
+        """Sums over samples of each pixel, or of some, as ``imaging.film`` has them."""
         n_aovs = len(self.aov_names())
-        return plain_sums(sensor, sampler, spp, seed, shade, n_aovs, self.aovs, first)
+        return plain_sums(sensor, sampler, spp, seed, shade, n_aovs, self.aovs, first, pixels)
 
     def put(self, sensor: mi.Sensor, sums: Sums, spp: int) -> None:
         """Put sums over ``spp`` samples to the film of a sensor; the list is used up."""
@@ -233,6 +234,25 @@ class CachedIntegrator(mi.SamplingIntegrator):
                 dr.eval(picture)
         return picture
 
+    def pixel_sums(
+        self, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int, pixels: range
+    ) -> Sums:
+        """What ``render`` puts to the film for some pixels, of ``imaging.film.pixel_ranges``.
+
+        ``put`` makes the picture of all of them, the same to the bit. Raises ``ValueError`` as
+        ``prepare`` does, and if ``sampler`` isn't ``coherent``.
+        """
+        self.require_coherent("renders all pixels at once")
+        baked = self.prepare(scene, sensor, spp)
+        with dr.suspend_grad():
+            shade = self._shade(scene, self._lookup(scene, baked, spp), seed)
+            return self.sums(sensor, None, spp, seed, shade, pixels=pixels)
+
+    def require_coherent(self, otherwise: str) -> None:
+        """Raise ``ValueError`` unless sample points are our own: others do ``otherwise``."""
+        if self.sampler != "coherent":
+            raise ValueError(f'{self.owner}: "sampler" {self.sampler} {otherwise}; leave it out')
+
     def progressive(
         self,
         scene: mi.Scene,
@@ -252,10 +272,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
         ``coherent``.
         """
         deadline = time.perf_counter() + seconds
-        if self.sampler != "coherent":
-            raise ValueError(
-                f'{self.owner}: "sampler" {self.sampler} has no end of samples; leave it out'
-            )
+        self.require_coherent("has no end of samples")
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
         baked = self.prepare(scene, sensor, total)
@@ -277,8 +294,8 @@ class CachedIntegrator(mi.SamplingIntegrator):
     def _shade(self, scene, lookup: Lookup, seed: int) -> Shade:
         rules = self.rules(seed)
 
-        def shade(sampler, ray, index):
-            rules_ = rules.of_sample(index)
+        def shade(sampler, ray, index, pixel):
+            rules_ = rules.of_sample(index, pixel)
             return camera_radiance(scene, lookup, rules_, sampler, ray, mi.Bool(True))
 
         return shade
@@ -337,8 +354,8 @@ class CachedIntegrator(mi.SamplingIntegrator):
             )
         lookup = self._lookup(scene, self.prepare(scene), sampler.sample_count())
         self._passes += 1
-        rules = self.rules(self._passes)
         ray, active = mi.Ray3f(ray), mi.Bool(active)
+        rules = self.rules(self._passes).of_sample(0, dr.arange(mi.UInt32, dr.width(ray)))
         found = camera_radiance(scene, lookup, rules, sampler, ray, active)
         if dr.grad_enabled(found.radiance):
             self._refuse_gradients()
@@ -373,10 +390,10 @@ class GatheringIntegrator(CachedIntegrator):
             clamp=dr.opaque(mi.Float, self.clamp_indirect) if self.clamp_indirect else None,
         )
 
-    def sums(self, sensor, sampler, spp, seed, shade, first=0) -> Sums:
+    def sums(self, sensor, sampler, spp, seed, shade, first=0, pixels=None) -> Sums:
         if not (self._shares() or self.indirect_aovs):
-            return super().sums(sensor, sampler, spp, seed, shade, first)
-        return gathered_sums(sensor, sampler, spp, seed, shade, first)
+            return super().sums(sensor, sampler, spp, seed, shade, first, pixels)
+        return gathered_sums(sensor, sampler, spp, seed, shade, first, pixels)
 
     def put(self, sensor, sums, spp) -> None:
         if not (self._shares() or self.indirect_aovs):

@@ -20,7 +20,7 @@ import pytest
 import envmap_integrator
 from compare.hard_cases import empty_mesh
 from envmap_integrator.cli import commands
-from envmap_integrator.cli.scene_file import SceneFile, parse_assignment
+from envmap_integrator.cli.arguments import parse_assignment
 from envmap_integrator.imaging import film
 from envmap_integrator.imaging.denoiser import warm_up
 from envmap_integrator.preparation.maps.clusters import ClusterRequest, listed_clusters
@@ -29,6 +29,7 @@ from envmap_integrator.system.atomic import check_writable, replacing
 from envmap_integrator.system.checks import check_not_frozen, check_scene, check_variant
 from envmap_integrator.system.llvm import ensure_llvm
 from envmap_integrator.system.parameters import Parameters
+from envmap_integrator.system.scene_file import SceneFile
 from tests.helpers import (
     at,
     ball,
