@@ -7,13 +7,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import dask
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from distributed import Client
 
 from ..imaging.film import n_pixels_of, pixel_ranges
+from ..preparation.baked_state import BakedState
 from ..system.interrupt import interruptible
 from ..system.jit import upload
 from ..system.progress import stage
@@ -107,7 +107,7 @@ def render_job(
     integrator.require_coherent("renders all pixels at once")
     check_workers(client, job)
     calls, parts, frames = [], [], []
-    states: dict[int, tuple] = {}
+    states: dict[int, tuple[BakedState, bytes]] = {}
     n_workers = len(client.scheduler_info()["workers"])
     for index, view in enumerate(views):
         with view.of(scene) as sensor:
@@ -115,18 +115,19 @@ def render_job(
             samples = spp or sensor.sampler().sample_count()
             baked = integrator.prepare(scene, sensor, samples)
         if id(baked) not in states:
-            states[id(baked)] = baked, *_sent(client, baked)
-        _, state, digest = states[id(baked)]
+            states[id(baked)] = baked, _file_of(baked)
+            client.run(worker.receive, states[id(baked)][1], on_error="ignore")
+        _, state = states[id(baked)]
+        digest = worker.state_digest(state)
         left = (len(views) - index) * n_pixels
         for pixels in pixel_ranges(n_pixels, _sizes(n_pixels, left, samples, n_workers)):
-            call = (state, digest, job, view, seed, samples, pixels.start, pixels.stop)
-            calls.append(call)
-            parts.append((index, pixels))
+            calls.append((digest, job, view, seed, samples, pixels.start, pixels.stop))
+            parts.append((index, pixels, state))
         frames.append(_Frame(view, samples, n_pixels))
     n_all = sum(frame.n_pixels for frame in frames)
     with stage("Rendering by workers", total=n_all) as advance:
-        for index, sums in results(client, worker.render, calls, time_limit):
-            which, pixels = parts[index]
+        for index, sums in results(client, worker.render, calls, time_limit, lambda i: parts[i][2]):
+            which, pixels, _ = parts[index]
             frames[which].take(pixels, sums)
             advance(len(pixels))
             if frames[which].left == 0:
@@ -143,9 +144,9 @@ def check_workers(client: Client, job: Job) -> None:
             "with: dask worker ADDRESS"
         ) from None
     for address, fault in client.run(worker.look, job, on_error="return").items():
-        if isinstance(fault, ModuleNotFoundError):
-            fault = f'has no package "{fault.name}"; install envmap_integrator there'
-        if fault:
+        if "No module named 'envmap_integrator" in str(fault):
+            fault = "has no package envmap_integrator; install it there"
+        if fault and not isinstance(fault, OSError):  # Those have died; others are asked later.
             raise ValueError(f"worker {address}: {' '.join(str(fault).split())}")
 
 
@@ -176,15 +177,12 @@ class _Frame:
         return picture
 
 
-def _sent(client: Client, baked) -> tuple:
-    """The file of a baked state as a task, and its digest."""
+def _file_of(baked: BakedState) -> bytes:
+    """The content of the file that a baked state is saved to."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "state.exr"
         baked.save(path)
-        content = path.read_bytes()
-    digest = worker.state_digest(content)
-    with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1TB"}):
-        return client.submit(worker.keep, content, key=f"envmap-state-{digest}"), digest
+        return path.read_bytes()
 
 
 def _sizes(n_pixels: int, left: int, spp: int, n_workers: int) -> Iterator[int]:

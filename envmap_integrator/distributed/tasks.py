@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+from dask import config
 from distributed import Client, Future, KilledWorker
 
 from .worker import Outcome
@@ -26,14 +27,18 @@ def results(
     function: Callable[..., Outcome],
     calls: Sequence[tuple],
     time_limit: float = TIME_LIMIT,
+    lacking: Callable[[int], Any] = lambda index: None,
 ) -> Iterator[tuple[int, Any]]:
     """The values of ``function(*call)`` for all calls, each once, with their indices, as they end.
+
+    Where a worker answers that it lacks something, the call is sent again with ``lacking(index)``
+    as its last argument.
 
     What a worker had that died, hung or ran out of memory is done again by another one. Raises
     ``RuntimeError``, in one line, if workers report a fault, or die or hang at the same call again
     and again, or if none is left.
     """
-    crew = _Crew(client, function, calls, time_limit)
+    crew = _Crew(client, function, calls, time_limit, lacking)
     try:
         for index in range(len(calls)):
             crew.submit(index)
@@ -48,14 +53,14 @@ class _Crew:
     """Workers, and the calls that they have.
 
     pending   future of each call that hasn't ended
-    tries     how often each call has been sent
+    tries     how often each call has been lost
     since     when each worker that has work was last known to do well
-    hung      workers that get nothing any more
+    hung      workers that get nothing unless they answer after all
     """
 
-    def __init__(self, client, function, calls, time_limit):
+    def __init__(self, client, function, calls, time_limit, lacking):
         self.client, self.function, self.calls = client, function, calls
-        self.time_limit = time_limit
+        self.time_limit, self.lacking = time_limit, lacking
         self.pending: dict[int, Future] = {}
         self.tries = [0] * len(calls)
         self.since: dict[str, float] = {}
@@ -64,13 +69,13 @@ class _Crew:
         self._abandoned: list[Future] = []
         self._ended: queue.SimpleQueue[tuple[int, Future]] = queue.SimpleQueue()
 
-    def submit(self, index: int) -> None:
-        """Send a call, to any worker that isn't hung."""
-        self.tries[index] += 1
+    def submit(self, index: int, *more: Any) -> None:
+        """Send a call, with ``more`` arguments, to any worker that isn't hung."""
         others = self._workers() - self.hung if self.hung else None
         future = self.client.submit(
             self.function,
             *self.calls[index],
+            *more,
             pure=False,
             retries=MOST_TRIES - 1,
             workers=sorted(others) if others else None,
@@ -88,13 +93,16 @@ class _Crew:
             except queue.Empty:
                 return
             wait = 0.0
-            if self.pending.get(index) is not future:
-                continue  # Another worker has been asked since.
-            outcome = self._outcome(index, future)
+            # Where another worker has been asked since, it's the first answer that counts.
+            last = self.pending.get(index) is future
+            outcome = self._outcome(index, future) if last or future.status == "finished" else None
             if outcome is not None:
-                del self.pending[index]
+                self.hung.discard(outcome.worker)
                 self.since[outcome.worker] = time.monotonic()
-                yield index, outcome.value
+                if outcome.lacks:
+                    self._complete(index, future)
+                elif self.pending.pop(index, None):
+                    yield index, outcome.value
             if time.monotonic() - self.last_look > PERIOD:
                 return
 
@@ -111,13 +119,21 @@ class _Crew:
         try:
             outcome = future.result(timeout=self.time_limit)
         except Exception as error:  # Lost with the worker that had it.
-            self._again(index, f"results get lost ({type(error).__name__})")
+            if self.pending.get(index) is future:
+                self._again(index, f"results get lost ({type(error).__name__})")
             return None
         if outcome.fault:
             raise RuntimeError(f"worker {outcome.worker}: {outcome.fault}")
         return outcome
 
+    def _complete(self, index: int, future: Future) -> None:
+        """Send a call with what the worker that got it lacks."""
+        if self.pending.get(index) is future:
+            with config.set({"distributed.admin.large-graph-warning-threshold": "1TB"}):
+                self.submit(index, self.lacking(index))
+
     def _again(self, index: int, reason: str) -> None:
+        self.tries[index] += 1
         if self.tries[index] >= MOST_TRIES:
             raise RuntimeError(f"{reason}, {MOST_TRIES} times; see the logs of the workers")
         # Not cancelled: a hung worker would get the next call at once.

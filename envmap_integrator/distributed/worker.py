@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from distributed import get_worker
+from distributed import Worker, get_worker
 
+from ..system.atomic import replacing
 from .job import Job, View
 
 #: Environment variable with the number of threads of a worker; else it's one per core.
@@ -27,11 +28,14 @@ _scene: mi.Scene | None = None
 
 
 class Outcome(NamedTuple):
-    """What a worker answers: a value, or a fault that would meet the next one too."""
+    """What a worker answers: a value, a fault that would meet the next one too, or that it lacks
+    what it hasn't been sent yet.
+    """
 
     worker: str
     value: Any
     fault: str = ""
+    lacks: bool = False
 
 
 def state_digest(state: bytes) -> str:
@@ -39,28 +43,42 @@ def state_digest(state: bytes) -> str:
     return hashlib.blake2b(state, digest_size=16).hexdigest()
 
 
-def keep(state: bytes) -> bytes:
-    """The content of a baked state's file, as a task: workers get it from each other, and anew if
-    those who had it have died.
-    """
-    return state
-
-
 async def look(job: Job) -> str:
     """What is wrong with this worker; nothing if it can render."""
     return await asyncio.wrap_future(_thread.submit(_fault, job))
 
 
+def receive(state: bytes, dask_worker: Worker) -> None:
+    """Keep the file of a baked state, in the worker's own folder, which Dask removes."""
+    path = _path(dask_worker, state_digest(state))
+    if not path.exists():
+        with replacing(path) as file:
+            file.write(state)
+
+
 def render(
-    state: bytes, digest: str, job: Job, view: View, seed: int, spp: int, begin: int, end: int
+    digest: str,
+    job: Job,
+    view: View,
+    seed: int,
+    spp: int,
+    begin: int,
+    end: int,
+    state: bytes | None = None,
 ) -> Outcome:
     """Sums over the samples of the pixels ``begin … end`` of a view, [channels, pixels] float32.
 
-    ``state`` is the file of the baked state, ``digest`` its ``state_digest``.
+    ``digest`` is the ``state_digest`` of the baked state; ``state`` is its file, for a worker that
+    lacks it: it may have come later than the others.
     """
     worker = get_worker()
-    arguments = (Path(worker.local_directory), state, digest, job, view, seed, spp)
-    return _thread.submit(_render, worker.address, *arguments, range(begin, end)).result()
+    if state is not None:
+        receive(state, worker)
+    path = _path(worker, digest)
+    if not path.exists():
+        return Outcome(worker.address, None, lacks=True)
+    arguments = (worker.address, path, job, view, seed, spp, range(begin, end))
+    return _thread.submit(_render, *arguments).result()
 
 
 def _fault(job: Job) -> str:
@@ -70,16 +88,14 @@ def _fault(job: Job) -> str:
         return _one_line(error)
 
 
-def _render(address, folder, state, digest, job, view, seed, spp, pixels) -> Outcome:
+def _render(address, state, job, view, seed, spp, pixels) -> Outcome:
     try:
         fault = _fault(job)
-        if not fault and state_digest(state) != digest:
-            fault = "got a damaged baked state; check its network"
         if fault:
             return Outcome(address, None, fault)
         scene = _opened(job)
         integrator = scene.integrator()
-        integrator.cache_file = str(_stored(folder, state, digest))
+        integrator.cache_file = str(state)
         with view.of(scene) as sensor:
             sums = integrator.pixel_sums(scene, sensor, seed, spp, pixels)
         return Outcome(address, np.stack([value.numpy() for value in sums]))
@@ -102,12 +118,8 @@ def _opened(job: Job) -> mi.Scene:
     return _scene
 
 
-def _stored(folder: Path, state: bytes, digest: str) -> Path:
-    """A file with the baked state in the worker's own folder, which Dask removes."""
-    path = folder / f"state-{digest}.exr"
-    if not path.exists():
-        path.write_bytes(state)
-    return path
+def _path(worker: Worker, digest: str) -> Path:
+    return Path(worker.local_directory) / f"state-{digest}.exr"
 
 
 def _one_line(error: Exception) -> str:
