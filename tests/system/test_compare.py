@@ -41,6 +41,7 @@ TINY = {
     },
     "bias": {"spp": 4, "patches": 256, "finer": 4},
     "render": {"spp": 4},
+    "workers": {"spp": 4, "workers": (1,), "sleepers": (2,), "seconds": 0.5},
 }
 
 
