@@ -91,7 +91,11 @@ class Job:
 
     def load(self) -> mi.Scene:
         """The scene. Meshes aren't merged: else a baked state needn't fit in other processes."""
+        threads = dr.thread_count()
+        # With a single thread, Mitsuba may wait for ever for what it loads in parallel.
+        dr.set_thread_count(max(threads, 2))
         scene = self._file().load(merge_meshes=False)
+        dr.set_thread_count(threads)
         if self.denoise:
             prepare_for_denoiser(scene.integrator())
         return scene

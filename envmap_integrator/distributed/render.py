@@ -50,15 +50,18 @@ def render_distributed(
     Raises ``ValueError`` as ``integrator.render`` does, and for workers that can't give the same
     picture; ``RuntimeError`` if workers fail again and again, or none is left.
     """
-    views = [View(sensor)]
-    job = Job.of(
-        Path(scene_file),
-        parameters=dict(parameters or {}),
+    (found,) = render_views(
+        scene_file,
+        client,
+        [View(sensor)],
         integrator=integrator,
-        settings=dict(settings or {}),
+        settings=settings,
+        parameters=parameters,
+        spp=spp,
+        seed=seed,
+        time_limit=time_limit,
     )
-    ((_, picture),) = render_job(client, job, job.load(), views, spp, seed, time_limit)
-    return picture
+    return found[1]
 
 
 def render_views(
@@ -107,32 +110,46 @@ def render_job(
         )
     integrator.require_coherent("renders all pixels at once")
     check_workers(client, job)
-    calls, parts, frames = [], [], []
-    states: dict[int, tuple[BakedState, bytes]] = {}
+    frames = _prepared(client, scene, views, spp)
     n_workers = len(client.scheduler_info()["workers"])
-    for index, view in enumerate(views):
-        with view.of(scene) as sensor:
-            n_pixels = n_pixels_of(sensor.film())
-            samples = spp or sensor.sampler().sample_count()
-            baked = integrator.prepare(scene, sensor, samples)
-        if id(baked) not in states:
-            states[id(baked)] = baked, _file_of(baked)
-            client.run(worker.receive, states[id(baked)][1], on_error="ignore")
-        _, state = states[id(baked)]
-        digest = worker.state_digest(state)
-        left = (len(views) - index) * n_pixels
-        for pixels in pixel_ranges(n_pixels, part_sizes(n_pixels, left, samples, n_workers)):
-            calls.append((digest, job, view, seed, samples, pixels.start, pixels.stop))
-            parts.append((index, pixels, state))
-        frames.append(_Frame(view, samples, n_pixels))
+    parts = []
+    for index, frame in enumerate(frames):
+        left = (len(frames) - index) * frame.n_pixels
+        sizes = part_sizes(frame.n_pixels, left, frame.spp, n_workers)
+        parts += [(index, pixels) for pixels in pixel_ranges(frame.n_pixels, sizes)]
+    calls = []
+    for index, pixels in parts:
+        frame = frames[index]
+        digest = worker.state_digest(frame.state)
+        calls.append((digest, job, frame.view, seed, frame.spp, pixels.start, pixels.stop))
+
+    def state_of(call: int) -> bytes:
+        return frames[parts[call][0]].state
+
     n_all = sum(frame.n_pixels for frame in frames)
     with stage("Rendering by workers", total=n_all) as advance:
-        for index, sums in results(client, worker.render, calls, time_limit, lambda i: parts[i][2]):
-            which, pixels, _ = parts[index]
-            frames[which].take(pixels, sums)
+        for call, sums in results(client, worker.render, calls, time_limit, state_of):
+            index, pixels = parts[call]
+            frames[index].take(pixels, sums)
             advance(len(pixels))
-            if frames[which].left == 0:
-                yield which, frames[which].picture(scene)
+            if frames[index].left == 0:
+                yield index, frames[index].picture(scene)
+
+
+def _prepared(client: Client, scene: mi.Scene, views: Sequence[View], spp: int) -> list[_Frame]:
+    """Views with their baked states, which the workers get."""
+    frames = []
+    known: dict[int, tuple[BakedState, bytes]] = {}
+    for view in views:
+        with view.of(scene) as sensor:
+            samples = spp or sensor.sampler().sample_count()
+            baked = scene.integrator().prepare(scene, sensor, samples)
+            n_pixels = n_pixels_of(sensor.film())
+        if id(baked) not in known:
+            known[id(baked)] = baked, _file_of(baked)
+            client.run(worker.receive, known[id(baked)][1], on_error="ignore")
+        frames.append(_Frame(view, samples, n_pixels, known[id(baked)][1]))
+    return frames
 
 
 def check_workers(client: Client, job: Job) -> None:
@@ -154,11 +171,13 @@ def check_workers(client: Client, job: Job) -> None:
 class _Frame:
     """The sums over the samples of a view's pixels, as they come.
 
-    left   number of pixels that haven't come yet
+    state   file of the baked state
+    left    number of pixels that haven't come yet
     """
 
-    def __init__(self, view: View, spp: int, n_pixels: int):
-        self.view, self.spp, self.n_pixels, self.left = view, spp, n_pixels, n_pixels
+    def __init__(self, view: View, spp: int, n_pixels: int, state: bytes):
+        self.view, self.spp, self.state = view, spp, state
+        self.n_pixels = self.left = n_pixels
         self._sums: np.ndarray | None = None
 
     def take(self, pixels: range, sums: np.ndarray) -> None:

@@ -109,8 +109,6 @@ def _opened(job: Job) -> mi.Scene:
     global _job, _scene
     if job != _job:
         _job = _scene = None
-        # With a single thread, Mitsuba may wait for ever for what it loads in parallel.
-        dr.set_thread_count(max(dr.thread_count(), 2))
         _scene = job.load()
         _job = job
         if THREADS in os.environ:

@@ -126,6 +126,15 @@ def test_pixels_of_ranges_are_those_of_the_whole(kind, settings, lanes, tmp_path
     assert np.array_equal(sensor.film().develop().numpy(), expected)
 
 
+@pytest.mark.parametrize("n_workers", [1, 2, 64])
+@pytest.mark.parametrize("n_pixels", [1, 100, 640 * 480])
+def test_parts_cover_a_picture_and_shrink(n_pixels, n_workers):
+    sizes = [*render.part_sizes(n_pixels, n_pixels, 64, n_workers)]
+    assert sum(sizes) == n_pixels
+    assert sizes == sorted(sizes, reverse=True)
+    assert len(sizes) == 1 or max(sizes) * 64 <= render.MOST_SAMPLES
+
+
 # ---------------------- Pictures ----------------------
 
 
