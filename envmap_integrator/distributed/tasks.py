@@ -98,7 +98,7 @@ class _Crew:
             outcome = self._outcome(index, future) if last or future.status == "finished" else None
             if outcome is not None:
                 self.hung.discard(outcome.worker)
-                self.since[outcome.worker] = time.monotonic()
+                self.since[outcome.worker] = self.last_worker = time.monotonic()
                 if outcome.lacks:
                     self._complete(index, future)
                 elif self.pending.pop(index, None):

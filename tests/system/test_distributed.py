@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 import psutil
 import pytest
-from distributed import Client, LocalCluster
+from distributed import Client, LocalCluster, Status
 
 from envmap_integrator.cli import main
 from envmap_integrator.distributed import cluster, render, tasks
@@ -80,6 +80,13 @@ def processes(parent: int | None = None) -> list[psutil.Process]:
     """Those of the workers that are there, of all clusters of this process or another one."""
     children = psutil.Process(parent).children(recursive=True)
     return [child for child in children if "spawn_main" in " ".join(child.cmdline())]
+
+
+def at_work(client) -> list[psutil.Process]:
+    """Those that have started: Dask gives up one that dies before."""
+    workers = [nanny.process for nanny in client.cluster.workers.values()]
+    pids = [worker.pid for worker in workers if worker and worker.status is Status.running]
+    return [psutil.Process(pid) for pid in pids if pid is not None and psutil.pid_exists(pid)]
 
 
 # ---------------------- Parts of a picture ----------------------
@@ -221,7 +228,7 @@ def test_killed_workers(client, at_once, kills, when_a_part_comes, monkeypatch):
 
     def kill(number):
         if number % 2 == 0 and len(killed) < kills:
-            for process in rng.permutation(processes())[: rng.integers(1, 3)]:
+            for process in rng.permutation(at_work(client))[: rng.integers(1, 3)]:
                 process.kill()
                 killed.append(process)
 
