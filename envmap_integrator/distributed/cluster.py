@@ -52,7 +52,8 @@ def local(n_workers: int, n_threads: int) -> Iterator[Client]:
     threads = max(n_threads // n_workers, 1)
     settings = {
         "distributed.scheduler.allowed-failures": ALLOWED_FAILURES,
-        "distributed.worker.daemon": True,
+        # Else one that is being restarted at the wrong moment would be given up.
+        "distributed.deploy.lost-worker-timeout": "1 day",
     }
     with (
         dask.config.set(settings),
