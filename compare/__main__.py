@@ -19,6 +19,7 @@ from compare.experiments import (
     gallery,
     render,
     resolution,
+    workers,
 )
 from compare.options import add_options, read_options
 from envmap_integrator.cli.commands import activate_variant
@@ -34,6 +35,7 @@ EXPERIMENTS: dict[str, ModuleType] = {
     "flicker": flicker,
     "gallery": gallery,
     "render": render,
+    "workers": workers,
 }
 """Each module has ``Options`` and ``run(options, folder)``; its docstring is the help."""
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import mitsuba as mi
 
-from envmap_integrator.cli.scene_file import SceneFile
+from envmap_integrator.system.scene_file import SceneFile
 
 OWN_SCENES = Path(__file__).parents[1] / "scenes"
 PAPER_ROOM = OWN_SCENES / "paper_room.xml"

@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import NoReturn
 
 from envmap_integrator.cli import commands
+from envmap_integrator.cli.arguments import parse_assignment, parse_setting
 from envmap_integrator.cli.doctor import doctor
 from envmap_integrator.cli.errors import condense
 from envmap_integrator.cli.export import export
-from envmap_integrator.cli.scene_file import parse_assignment, parse_setting
 from envmap_integrator.system import progress
 from envmap_integrator.system.interrupt import interruptible
 
@@ -75,6 +75,7 @@ RENDER_EXAMPLES = """examples:
   envmap-render render room.xml --target-error 1e-3
   envmap-render render room.xml --set residual_probability=0.5 # without bias, more noise
   envmap-render render room.xml -D resx=320 -s 1               # smaller, second sensor
+  envmap-render render room.xml --cluster tcp://render-1:8786  # by several machines
   envmap-render render room.xml --json | jq .seconds
 
 """
@@ -145,6 +146,16 @@ def build_parser() -> argparse.ArgumentParser:
     )
     render.add_argument(
         "--resume", action="store_true", help="go on from what --progressive has kept beside OUTPUT"
+    )
+    by_workers = render.add_mutually_exclusive_group()
+    by_workers.add_argument(
+        "--workers", type=int, metavar="N", help="render by N processes of this machine"
+    )
+    by_workers.add_argument(
+        "--cluster", metavar="ADDRESS", help="render by the workers of a Dask scheduler, tcp://…"
+    )
+    render.add_argument(
+        "--tls", nargs=3, metavar=("CA", "CERT", "KEY"), help="files (PEM) for a tls:// scheduler"
     )
     render.set_defaults(command=commands.render)
 

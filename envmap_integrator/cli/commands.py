@@ -6,6 +6,7 @@ import argparse
 import json
 import math
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import drjit as dr
@@ -15,8 +16,8 @@ from rich.console import Console
 from rich.table import Table
 
 import envmap_integrator
+from envmap_integrator.cli import workers
 from envmap_integrator.cli.output import write_bitmap, write_png
-from envmap_integrator.cli.scene_file import DEFAULT_INTEGRATOR, SceneFile
 from envmap_integrator.cli.timing import compilation_time, measure, record_kernels
 from envmap_integrator.imaging.denoiser import denoise, prepare_for_denoiser, warm_up
 from envmap_integrator.imaging.progressive import Improving
@@ -24,6 +25,7 @@ from envmap_integrator.inspection.page import load_template, page
 from envmap_integrator.inspection.survey import survey
 from envmap_integrator.system.atomic import check_writable, replacing
 from envmap_integrator.system.llvm import ensure_llvm
+from envmap_integrator.system.scene_file import DEFAULT_INTEGRATOR, SceneFile
 
 
 def render(args: argparse.Namespace) -> int:
@@ -34,7 +36,8 @@ def render(args: argparse.Namespace) -> int:
     _configure_machine(args)
     seconds: dict[str, float] = {}
     with record_kernels():
-        scene_file, scene = _load(args, seconds)
+        # Merged meshes have another order in each process.
+        scene_file, scene = _load(args, seconds, merge_meshes=not _by_workers(args))
         sensor = _sensor(scene, args.sensor)
         settings = _settings(args, scene_file, scene, sensor)
         more: dict[str, float] = {}
@@ -54,18 +57,28 @@ def _improves(args: argparse.Namespace) -> bool:
     return args.progressive or args.resume or ends
 
 
+def _by_workers(args: argparse.Namespace) -> bool:
+    """Are other processes to render?"""
+    return args.workers is not None or args.cluster is not None
+
+
 def _render_at_once(args, scene, sensor, settings, seconds, more) -> mi.Bitmap:
     integrator = scene.integrator()
     for_denoiser = args.denoise and prepare_for_denoiser(integrator)
     if args.denoise:  # Fails before the work starts, if there is no denoiser.
         warm_up(*sensor.film().crop_size())
-    if hasattr(integrator, "prepare"):
-        state = integrator.prepare(scene, sensor, args.spp)
-        seconds |= state.stage_times
-        more["cache_error"] = state.relative_error
-    with measure(seconds, "render"):
-        # Not mi.render, which would make another exception of Ctrl-C.
-        dr.eval(integrator.render(scene, sensor, seed=args.seed, spp=args.spp))
+    with ExitStack() as stack:
+        render = integrator.render
+        if _by_workers(args):
+            with measure(seconds, "find workers"):
+                render = workers.renderer(args, stack)
+        if hasattr(integrator, "prepare"):
+            state = integrator.prepare(scene, sensor, args.spp)
+            seconds |= state.stage_times
+            more["cache_error"] = state.relative_error
+        with measure(seconds, "render"):
+            # Not mi.render, which would make another exception of Ctrl-C.
+            dr.eval(render(scene, sensor, seed=args.seed, spp=args.spp))
     bitmap = sensor.film().bitmap()
     if args.denoise:
         with measure(seconds, "denoise"):
@@ -93,6 +106,11 @@ def _improve(args, scene, sensor, settings, seconds, more, output) -> mi.Bitmap:
     )
     for flag, value in (("--time", args.time), ("--target-error", args.target_error)):
         _require(value is None or value > 0, f"{flag} must be above 0, got {value}")
+    _require(
+        not _by_workers(args),
+        "--workers and --cluster render one picture: leave out --progressive, --time and "
+        "--target-error",
+    )
     asked = args.time is not None or args.target_error is not None
     total = args.spp or (MOST if asked else settings["spp"])
     begin = time.perf_counter()

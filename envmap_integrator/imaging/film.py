@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from operator import add
 
@@ -12,7 +12,7 @@ import mitsuba as mi
 from ..lookup.lookup import Lookup
 from ..system.fingerprint import SensorConstants
 from ..system.interrupt import memory, not_interrupted
-from ..system.jit import give_back, rgb
+from ..system.jit import LANES_ALIKE, give_back, rgb
 from ..system.progress import stage
 from ..system.recording import Recorder
 from ..transport.camera import CameraSample
@@ -41,23 +41,29 @@ class Shading:
     aovs: tuple[Aov, ...] = ()
 
     def __call__(
-        self, sampler: mi.Sampler | SamplePoints, ray: mi.Ray3f, index: mi.UInt32
+        self,
+        sampler: mi.Sampler | SamplePoints,
+        ray: mi.Ray3f,
+        index: mi.UInt32,
+        pixel: mi.UInt32,
     ) -> CameraSample:
-        """The light that comes along the ray of the sample of an index."""
-        rules, active = self.rules.of_sample(index), mi.Bool(True)
+        """The light that comes along the ray of the sample of an index in its pixel."""
+        rules, active = self.rules.of_sample(index, pixel), mi.Bool(True)
         return camera_sample(self.scene, self.lookup, rules, self.aovs, sampler, ray, active)
 
 
 @dataclass(frozen=True)
 class Share:
-    """Which samples of a pixel a lane takes, all [1].
+    """Which samples of which pixel a lane takes, all [1].
 
+    pixel          the first pixel
     seed           of the sample points,
     strata         ... and the ``shared_strata`` of all samples of a render
     start          the first sample
     least, longer  samples of each of the lanes that share a pixel, and how many take one more
     """
 
+    pixel: mi.UInt32
     seed: mi.UInt32
     strata: mi.UInt32
     start: mi.UInt32
@@ -65,12 +71,23 @@ class Share:
     longer: mi.UInt32
 
     @classmethod
-    def of(cls, seed: int | mi.UInt32, spp: int, start: int, parts: int) -> Share:
+    def of(cls, pixel: int, seed: int | mi.UInt32, spp: int, start: int, parts: int) -> Share:
         """Those of ``spp`` samples from ``start`` on for ``parts`` lanes."""
-        numbers = seed & 0xFFFFFFFF, shared_strata(spp), start, *divmod(spp, parts)
+        numbers = pixel, seed & 0xFFFFFFFF, shared_strata(spp), start, *divmod(spp, parts)
         share = cls(*map(mi.UInt32, numbers))
         dr.make_opaque(share)
         return share
+
+
+def pixel_ranges(n_pixels: int, sizes: Iterable[int]) -> list[range]:
+    """The pixels of a film in ranges of about these sizes, which may be rendered apart."""
+    ranges, begin = [], 0
+    for size in sizes:
+        end = min(begin + -(-size // LANES_ALIKE) * LANES_ALIKE, n_pixels)
+        if end > begin:
+            ranges.append(range(begin, end))
+        begin = end
+    return ranges
 
 
 def most_samples(sensor: mi.Sensor) -> int:
@@ -92,20 +109,22 @@ def plain_sums(
     n_aovs: int,
     aovs: Callable[[CameraSample], list[mi.Float]],
     first: int = 0,
+    pixels: range | None = None,
 ) -> Sums:
     """Render ``spp`` samples per pixel of a sensor.
 
     ``sampler`` is one of Mitsuba's, or None for our own sample points, from the ``first`` on.
     ``aovs`` gives the ``n_aovs`` values of a ``CameraSample`` that are to go to channels of their
-    own. Without them, ``recorder`` launches again what it has recorded.
+    own. Without them, ``recorder`` launches again what it has recorded. With our own sample points,
+    only some ``pixels`` may be asked for, as ``pixel_ranges`` gives them: their sums are those that
+    all have, to the bit.
     """
 
     def channels(film, found, weight):
         return [*_plain(film, found, weight), *(weight * value for value in aovs(found))]
 
-    if n_aovs:
-        return _accumulate(sensor, sampler, spp, seed, shading, _directly, channels, n_aovs, first)
-    return _accumulate(sensor, sampler, spp, seed, shading, recorder, _plain, 0, first)
+    record, made = (_directly, channels) if n_aovs else (recorder, _plain)
+    return _accumulate(sensor, sampler, spp, seed, shading, record, made, n_aovs, first, pixels)
 
 
 def put_plain(sensor: mi.Sensor, sums: Sums, names: list[str]) -> None:
@@ -122,11 +141,14 @@ def gathered_sums(
     shading: Shading,
     recorder: Recorder,
     first: int = 0,
+    pixels: range | None = None,
 ) -> Sums:
     """As ``plain_sums``, with the AOVs of ``shading``, and what surfaces gather taken apart."""
     n_aovs = sum(len(aov.channels()) for aov in shading.aovs)
     record, n_further = _directly if n_aovs else recorder, n_aovs + Gathered.count()
-    return _accumulate(sensor, sampler, spp, seed, shading, record, _apart, n_further, first)
+    return _accumulate(
+        sensor, sampler, spp, seed, shading, record, _apart, n_further, first, pixels
+    )
 
 
 def put_gathered(
@@ -184,7 +206,9 @@ def _directly(key, function, *inputs):
     return function(*inputs)
 
 
-def _accumulate(sensor, sampler, spp, seed, shading, recorder, channels, n_further, first) -> Sums:
+def _accumulate(
+    sensor, sampler, spp, seed, shading, recorder, channels, n_further, first, pixels
+) -> Sums:
     """Sums over the samples of each pixel, row by row, of ``channels(film, found, weight)``."""
     film = sensor.film()
     n_pixels, width = n_pixels_of(film), dr.opaque(mi.UInt32, int(film.crop_size()[0]))
@@ -193,10 +217,11 @@ def _accumulate(sensor, sampler, spp, seed, shading, recorder, channels, n_furth
     with stage("Rendering"):
         if sampler is None:
             parts = min(-(-MIN_LANES // n_pixels), spp)
-            share = Share.of(seed, spp, first, parts)
+            pixels = pixels or range(n_pixels)
+            share = Share.of(pixels.start, seed, spp, first, parts)
             constants = SensorConstants(sensor)
             record = _directly if constants.in_python else recorder
-            arguments = values, share, memory(), n_pixels, parts, n_channels
+            arguments = values, share, memory(), len(pixels), parts, n_channels
             # What film and sampler hold would be recorded too: as mi.render leaves them.
             film.prepare([])
             sensor.sampler().seed(0, 1)
@@ -222,27 +247,36 @@ class _Values:
         film = self.sensor.film()
         position = mi.Vector2i(pixel % self.width, pixel // self.width)
         position += mi.Vector2i(film.crop_offset())
-        sample = _sample(self.sensor, self.pixel_filter, sampler, self.shading, position, index)
+
+        def shade(sampler, ray):
+            return self.shading(sampler, ray, index, pixel)
+
+        sample = _sample(self.sensor, self.pixel_filter, sampler, shade, position)
         return self.channels(film, *sample)
 
 
 def _lane_per_pixel(values, share, memory, n_pixels, parts, n_channels):
     """A lane takes the samples of one pixel in turn, or a part of them where pixels are few.
 
-    Nothing is stored for a sample, and neighbouring lanes are neighbouring pixels.
+    Nothing is stored for a sample, and neighbouring lanes are neighbouring pixels: the same ones,
+    whichever range of pixels is rendered, since what rays hit that are traced together might hang
+    on each other in the last bit.
     """
-    lane, n_pixels_ = dr.arange(mi.UInt32, n_pixels * parts), dr.opaque(mi.UInt32, n_pixels)
-    pixel, part = lane % n_pixels_, lane // n_pixels_
+    row = n_pixels if parts == 1 else -(-n_pixels // LANES_ALIKE) * LANES_ALIKE
+    lane, row_ = dr.arange(mi.UInt32, row * parts), dr.opaque(mi.UInt32, row)
+    place, part = lane % row_, lane // row_
     first = share.start + part * share.least + dr.minimum(part, share.longer)
     end = first + share.least + dr.select(part < share.longer, mi.UInt32(1), 0)
-    sums = [dr.zeros(mi.Float, n_pixels * parts) for _ in range(n_channels)]
+    end = dr.select(place < dr.opaque(mi.UInt32, n_pixels), end, first)
+    sums = [dr.zeros(mi.Float, row * parts) for _ in range(n_channels)]
+    pixel = share.pixel + place
     points = SamplePoints.of(share.seed, pixel, share.strata, first)
     sums = _sums(values, points, pixel, end, memory, sums)
     if parts == 1:
         return sums
     dr.eval(sums)
-    parts_ = dr.opaque(mi.UInt32, parts)
-    lanes_of_pixel = lane % parts_ * n_pixels_ + lane // parts_
+    lane, parts_ = dr.arange(mi.UInt32, n_pixels * parts), dr.opaque(mi.UInt32, parts)
+    lanes_of_pixel = lane % parts_ * row_ + lane // parts_
     return [dr.block_sum(dr.gather(mi.Float, s, lanes_of_pixel), parts) for s in sums]
 
 
@@ -279,7 +313,7 @@ def _lane_per_sample(values, n_pixels, spp, seed, n_channels, sampler):
     return sums
 
 
-def _sample(sensor, pixel_filter, sampler, shade, position, index):
+def _sample(sensor, pixel_filter, sampler, shade, position):
     """The ``CameraSample`` of one sample of each pixel, weighted, and its weight in the pixel."""
     film = sensor.film()
     offset, filter_weight = pixel_filter.sample(sampler.next_2d())
@@ -290,7 +324,7 @@ def _sample(sensor, pixel_filter, sampler, shade, position, index):
     if sensor.shutter_open_time() > 0:
         time += sampler.next_1d() * sensor.shutter_open_time()
     ray, weight = sensor.sample_ray_differential(time, 0, within, aperture)
-    found = shade(sampler, mi.Ray3f(ray), index)
+    found = shade(sampler, mi.Ray3f(ray))
     return found.scaled(weight * filter_weight), filter_weight
 
 

@@ -123,10 +123,13 @@ class CachedIntegrator(mi.SamplingIntegrator):
         shading: Shading,
         recorder: Recorder,
         first: int = 0,
+        pixels: range | None = None,
     ) -> Sums:
-        """Sums over samples of each pixel, as ``imaging.film`` has them."""
+        """Sums over samples of each pixel, or of some, as ``imaging.film`` has them."""
         n_aovs, values = len(self.aov_names()), self.aov_values
-        return plain_sums(sensor, sampler, spp, seed, shading, recorder, n_aovs, values, first)
+        return plain_sums(
+            sensor, sampler, spp, seed, shading, recorder, n_aovs, values, first, pixels
+        )
 
     def put(self, sensor: mi.Sensor, sums: Sums, spp: int) -> None:
         """Put sums over ``spp`` samples to the film of a sensor; the list is used up."""
@@ -253,6 +256,26 @@ class CachedIntegrator(mi.SamplingIntegrator):
                 dr.eval(picture)
         return picture
 
+    def pixel_sums(
+        self, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int, pixels: range
+    ) -> Sums:
+        """What ``render`` puts to the film for some pixels, of ``imaging.film.pixel_ranges``.
+
+        ``put`` makes the picture of all of them, the same to the bit. Raises ``ValueError`` as
+        ``prepare`` does, and if ``sampler`` isn't ``coherent``.
+        """
+        self.require_coherent("renders all pixels at once")
+        now, baked = self._ready(scene, sensor, spp)
+        with dr.suspend_grad():
+            lookup, recorder = self._lookup(scene, now, baked, spp)
+            shading = Shading(scene, lookup, self.rules(seed), self.sample_aovs())
+            return self.sums(sensor, None, spp, seed, shading, recorder, pixels=pixels)
+
+    def require_coherent(self, otherwise: str) -> None:
+        """Raise ``ValueError`` unless sample points are our own: others do ``otherwise``."""
+        if self.sampler != "coherent":
+            raise ValueError(f'{self.owner}: "sampler" {self.sampler} {otherwise}; leave it out')
+
     def progressive(
         self,
         scene: mi.Scene,
@@ -280,10 +303,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
         ``progress_file`` that is missing, damaged, or of another scene, sensor or setting.
         """
         deadline = time.perf_counter() + seconds
-        if self.sampler != "coherent":
-            raise ValueError(
-                f'{self.owner}: "sampler" {self.sampler} has no end of samples; leave it out'
-            )
+        self.require_coherent("has no end of samples")
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
         size = sensor.film().crop_size()
@@ -395,8 +415,8 @@ class CachedIntegrator(mi.SamplingIntegrator):
             )
         lookup, _ = self._lookup(scene, *self._ready(scene, None, 0), sampler.sample_count())
         self._passes += 1
-        rules = self.rules(self._passes)
         ray, active = mi.Ray3f(ray), mi.Bool(active)
+        rules = self.rules(self._passes).of_sample(0, dr.arange(mi.UInt32, dr.width(ray)))
         found = camera_sample(scene, lookup, rules, self.sample_aovs(), sampler, ray, active)
         if dr.grad_enabled(found.radiance):
             self._refuse_gradients()
@@ -433,10 +453,10 @@ class GatheringIntegrator(CachedIntegrator):
             clamp=dr.opaque(mi.Float, self.clamp_indirect) if self.clamp_indirect else None,
         )
 
-    def sums(self, sensor, sampler, spp, seed, shading, recorder, first=0) -> Sums:
+    def sums(self, sensor, sampler, spp, seed, shading, recorder, first=0, pixels=None) -> Sums:
         if not (self._shares() or self.indirect_aovs):
-            return super().sums(sensor, sampler, spp, seed, shading, recorder, first)
-        return gathered_sums(sensor, sampler, spp, seed, shading, recorder, first)
+            return super().sums(sensor, sampler, spp, seed, shading, recorder, first, pixels)
+        return gathered_sums(sensor, sampler, spp, seed, shading, recorder, first, pixels)
 
     def put(self, sensor, sums, spp) -> None:
         if not (self._shares() or self.indirect_aovs):

@@ -103,7 +103,7 @@ def _estimates(rules: PathRules, path: Path) -> mi.Bool:
     """Whether paths go on where they could end, to estimate what is wrong with that."""
     if rules.residual is None:
         return mi.Bool(False)
-    return path.active & (rules.residual.decision(path.lane, path.bounces) < path.q)
+    return path.active & (rules.residual.decision(path.bounces) < path.q)
 
 
 # ---------------------- Stages ----------------------

@@ -34,10 +34,14 @@ class Residual:
     probability: mi.Float
     seed: mi.UInt32
 
-    def decision(self, lane: mi.UInt32, bounces: mi.UInt32) -> mi.Float:
-        """A random number in [0, 1) for each bounce of the lanes that share registers."""
+    def of_sample(self, index: mi.UInt32, lane: mi.UInt32) -> Residual:
+        """Those of a sample of a pixel; ``lane`` tells which pixels decide alike."""
         group = lane // LANES_ALIKE
-        return unit(mix(mix(self.seed ^ group * 0x9E3779B1) + bounces))
+        return replace(self, seed=mix(self.seed + index) ^ group * 0x9E3779B1)
+
+    def decision(self, bounces: mi.UInt32) -> mi.Float:
+        """A random number in [0, 1) for each bounce of the lanes that share registers."""
+        return unit(mix(mix(self.seed) + bounces))
 
 
 @dataclass(frozen=True)
@@ -63,9 +67,11 @@ class PathRules:
     residual: Residual | None = None
     clamp: mi.Float | None = None
 
-    def of_sample(self, index: mi.UInt32) -> PathRules:
-        """The same; each sample of a pixel decides anew where residuals are estimated."""
-        residual = self.residual and replace(self.residual, seed=mix(self.residual.seed + index))
+    def of_sample(self, index: mi.UInt32, lane: mi.UInt32) -> PathRules:
+        """The same; each sample of a pixel decides anew where residuals are estimated, in one way
+        for pixels whose lanes share registers.
+        """
+        residual = self.residual and self.residual.of_sample(index, lane)
         return replace(self, residual=residual)
 
 

@@ -92,7 +92,6 @@ class Path:
     reach                distance beyond which emitters that are hit have been counted
     throughput, eta      β [1], and the relative index of refraction so far
     q                    probability of going on where the cache or a map could end the path
-    lane                 number of the lane
     """
 
     active: mi.Bool
@@ -109,7 +108,6 @@ class Path:
     throughput: mi.Spectrum
     eta: mi.Float
     q: mi.Float
-    lane: mi.UInt32
 
     @staticmethod
     def begin(start: PathStart, rules: PathRules, active: mi.Bool) -> Path:
@@ -130,7 +128,6 @@ class Path:
             throughput=mi.Spectrum(1),
             eta=mi.Float(1),
             q=mi.Float(0) if residual is None else mi.Float(residual.probability),
-            lane=dr.arange(mi.UInt32, dr.width(start.ray)),
         )
 
 

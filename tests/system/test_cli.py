@@ -14,10 +14,10 @@ import pytest
 
 from envmap_integrator.cli import main
 from envmap_integrator.cli.output import write_bitmap
-from envmap_integrator.cli.scene_file import SceneFile
 from envmap_integrator.imaging.denoiser import denoise
 from envmap_integrator.system import progress
 from envmap_integrator.system.atomic import StorageError
+from envmap_integrator.system.scene_file import SceneFile
 from tests.helpers import at_most, unprivileged
 
 SCENE = """

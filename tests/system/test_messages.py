@@ -11,16 +11,23 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from distributed import KilledWorker
 
 import envmap_integrator
 from compare.hard_cases import empty_mesh
 from envmap_integrator.cli import commands
-from envmap_integrator.cli.scene_file import SceneFile, parse_assignment
+from envmap_integrator.cli.arguments import parse_assignment
+from envmap_integrator.distributed import tasks
+from envmap_integrator.distributed.cluster import connected as cluster_at
+from envmap_integrator.distributed.job import View
+from envmap_integrator.distributed.render import check_workers, render_job
+from envmap_integrator.distributed.worker import Outcome
 from envmap_integrator.imaging import film
 from envmap_integrator.imaging.aovs import parse_aovs
 from envmap_integrator.imaging.denoiser import warm_up
@@ -31,6 +38,7 @@ from envmap_integrator.system.atomic import check_writable, replacing
 from envmap_integrator.system.checks import check_not_frozen, check_scene, check_variant
 from envmap_integrator.system.llvm import ensure_llvm
 from envmap_integrator.system.parameters import Parameters
+from envmap_integrator.system.scene_file import SceneFile
 from tests.helpers import (
     at,
     ball,
@@ -253,7 +261,7 @@ def command_line(**options: object) -> argparse.Namespace:
     defaults = {"mode": "llvm_ad_rgb", "threads": None, "define": [], "set": [], "debug": False}
     defaults |= {"integrator": None, "sensor": 0, "spp": 1, "seed": 0, "png": False}
     defaults |= {"progressive": False, "time": None, "target_error": None, "resume": False}
-    defaults |= {"quiet": True, "json": False}
+    defaults |= {"quiet": True, "json": False, "workers": None, "cluster": None, "tls": None}
     return argparse.Namespace(**defaults | {"denoise": False} | options)
 
 
@@ -335,6 +343,91 @@ def setting(name: str, value: object, entry: str | None = None) -> Callable:
         (metadata[entry][0] if entry else metadata)[name] = value
 
     return change
+
+
+class Ended:
+    """What Dask gives of a call that has ended."""
+
+    key, status = "call", "error"
+
+    def __init__(self, error: Exception | None = None, outcome: Outcome | None = None):
+        self.error, self.outcome = error, outcome
+
+    def exception(self):
+        return self.error
+
+    def result(self, timeout: float):
+        if self.error:
+            raise self.error
+        return self.outcome
+
+
+def crew(workers: dict | None = None, **client: object) -> tasks._Crew:
+    """One that has sent a single call to a cluster that isn't there."""
+    here = {"status": "running", "scheduler": SimpleNamespace(address="tcp://here:1")}
+    here["scheduler_info"] = lambda: {"workers": workers or {}}
+    sent = tasks._Crew(SimpleNamespace(**here | client), None, [()], 9.0, None)
+    sent.pending[0] = Ended()
+    return sent
+
+
+def answered(status: str = "finished", **ended: object) -> Callable:
+    def action(_):
+        future = Ended(**ended)
+        future.status = status
+        sent = crew()
+        sent.pending[0], sent.tries[0] = future, tasks.MOST_TRIES
+        sent._outcome(0, future)
+
+    return action
+
+
+def died() -> KilledWorker:
+    return KilledWorker("call", SimpleNamespace(address="tcp://there:2"), 3)
+
+
+def looked_after(**client: object) -> Callable:
+    def action(_):
+        sent = crew(**client)
+        sent.last_look = sent.last_worker = -100.0
+        sent.look_after_workers()
+
+    return action
+
+
+def hung(_: Surroundings) -> None:
+    sent = crew(workers={"tcp://there:2": {}})
+    sent.tries[0] = tasks.MOST_TRIES
+    sent._give_up("tcp://there:2", [0])
+
+
+def nobody_comes(_: Surroundings) -> None:
+    def wait(n: int, timeout: float):
+        raise TimeoutError
+
+    check_workers(crew(wait_for_workers=wait).client, None)
+
+
+def another_version(_: Surroundings) -> None:
+    def run(*_, on_error: str):
+        return {"tcp://there:2": "has mitsuba 3.8.0 instead of 3.9.1; install that version there"}
+
+    check_workers(crew(wait_for_workers=lambda *_, timeout: None, run=run).client, None)
+
+
+def in_parts(kind: str, **settings: object) -> Callable:
+    scene = SimpleNamespace(integrator=lambda: mi.load_dict({"type": kind, **settings}))
+    return lambda _: next(render_job(None, None, scene, []))
+
+
+def no_such_sensor(_: Surroundings) -> None:
+    with View(3).of(load(room())):
+        pass
+
+
+def without_dask(s: Surroundings) -> None:
+    s.patch.setattr("importlib.util.find_spec", lambda name: None)
+    shell(commands.render, workers=2)(s)
 
 
 AGAIN = "make it again with envmap-render bake"
@@ -546,6 +639,49 @@ CASES = {
     ),
     "samples that end": Case(
         progressive_by_another_sampler, "one_level_path", '"sampler" independent', "leave it out"
+    ),
+    # ---- Workers ----
+    "a worker of another version": Case(
+        another_version, "worker tcp://there:2", "mitsuba 3.8.0", "install that version there"
+    ),
+    "a worker with a fault": Case(
+        answered(outcome=Outcome("tcp://there:2", None, "has no scene; copy it")),
+        "worker tcp://there:2", "has no scene", "copy it",
+    ),
+    "workers that die": Case(
+        answered("error", error=died()), "tcp://there:2", "workers die", "give it more memory"
+    ),
+    "workers that fail": Case(
+        answered("error", error=MemoryError("no memory")), "a worker", "no memory", "see its log"
+    ),
+    "lost results": Case(
+        answered(error=OSError("gone")), "results", f"{tasks.MOST_TRIES} times", "see the logs"
+    ),
+    "a hung worker": Case(hung, "worker tcp://there:2", "no result within 9 s", "see the logs"),
+    "no scheduler any more": Case(
+        looked_after(status="closed"), "tcp://here:1", "scheduler is gone", "start it again"
+    ),
+    "no worker any more": Case(
+        looked_after(), "tcp://here:1", "no worker is left", "start some there"
+    ),
+    "no worker": Case(nobody_comes, "tcp://here:1", "no worker has come within 60 s", "start some"),
+    "no scheduler": Case(
+        lambda _: cluster_at("tcp://127.0.0.1:x").__enter__(),
+        "tcp://127.0.0.1:x", "no scheduler answers", "start one with: dask scheduler",
+    ),
+    "path in parts": Case(
+        in_parts("path"), "MonteCarloIntegrator", "in parts", "take envmap_hybrid"
+    ),
+    "a sampler in parts": Case(
+        in_parts("one_level_path", sampler="independent"),
+        "one_level_path", '"sampler" independent', "leave it out",
+    ),
+    "another sensor": Case(no_such_sensor, "sensor 3", "the scene has 1", "count from 0"),
+    "no Dask": Case(without_dask, "Dask", "is missing", "pip install distributed"),
+    "no workers": Case(shell(commands.render, workers=0), "--workers", "0", "must be at least 1"),
+    "workers and progress": Case(
+        shell(commands.render, integrator="envmap_hybrid", workers=2, time=1.0),
+        "--workers", "one picture", "leave out --progressive, --time and --target-error",
     ),
     "nothing to bake": Case(
         shell(commands.bake), "integrator", '"path"', "pass --integrator envmap_hybrid"

@@ -1,0 +1,1 @@
+"""Rendering by several machines: a Dask cluster. Imported only where one is asked for."""
