@@ -54,6 +54,10 @@ def rgb(radiance: mi.Spectrum) -> tuple[mi.Float, mi.Float, mi.Float]:
     return tuple(radiance) if len(radiance) == 3 else (radiance[0],) * 3
 
 
+#: Steps of the R2 sequence (Roberts 2018).
+R2 = (0.7548776662466927, 0.5698402909980532)
+
+
 def mix(h: mi.UInt32) -> mi.UInt32:
     """Finaliser of MurmurHash3: every input bit affects every output bit."""
     h = (h ^ (h >> 16)) * 0x85EBCA6B

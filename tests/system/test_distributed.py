@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import signal
 import subprocess
 import sys
@@ -36,6 +37,8 @@ SPP = 20
 PARAMETERS = {"resx": "80", "resy": "60"}
 SETTINGS = {"patches": 1024}
 MANY_PARTS = 80 * 60 * SPP // 25
+#: Workers that are killed, for a longer run.
+KILLS = int(os.environ.get("ENVMAP_KILLS", 3))
 
 
 @pytest.fixture(scope="module")
@@ -220,14 +223,13 @@ def when_a_part_comes(monkeypatch):
     return install
 
 
-@pytest.mark.parametrize("kills", [3, pytest.param(50, marks=pytest.mark.slow)])
-def test_killed_workers(client, at_once, kills, when_a_part_comes, monkeypatch):
+def test_killed_workers(client, at_once, when_a_part_comes, monkeypatch):
     """Each time that a few parts have come, one worker is killed, or both are."""
     rng = np.random.default_rng(0)
     killed = []
 
     def kill(number):
-        if number % 2 == 0 and len(killed) < kills:
+        if number % 2 == 0 and len(killed) < KILLS:
             for process in rng.permutation(at_work(client))[: rng.integers(1, 3)]:
                 process.kill()
                 killed.append(process)
@@ -235,7 +237,7 @@ def test_killed_workers(client, at_once, kills, when_a_part_comes, monkeypatch):
     when_a_part_comes(kill)
     pictures = []
     with many_parts(monkeypatch):
-        while len(killed) < kills:
+        while len(killed) < KILLS:
             pictures.append(by_workers(client))
     assert all(np.array_equal(picture, at_once) for picture in pictures)
 

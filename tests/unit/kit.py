@@ -93,6 +93,7 @@ def surface_points(position: np.ndarray, normal, object_id=0, seen=1.0) -> Surfa
         normal,
         normal,
         np.broadcast_to(np.uint32(object_id), len(position)),
+        np.zeros(len(position), np.uint32),
         np.broadcast_to(np.float32(seen), len(position)),
         np.zeros(len(position), bool),
         np.zeros(len(position), np.uint32),

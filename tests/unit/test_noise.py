@@ -12,6 +12,7 @@ import pytest
 from envmap_integrator.preparation.coarse_mesh.patch_points import PatchPoints
 from envmap_integrator.preparation.radiosity.coarseness import Coarseness
 from envmap_integrator.preparation.radiosity.gather import block_mean, gather
+from envmap_integrator.preparation.radiosity.incidence import Incidence
 from envmap_integrator.preparation.radiosity.irradiance import solve_irradiance
 from envmap_integrator.preparation.radiosity.noise import TARGET, Noise
 from tests.helpers import Description, at, box, camera, emitting, grey, load, room
@@ -46,7 +47,8 @@ def solutions(scene: mi.Scene, more_rays: int = 0, count: int = 16, budget=BUDGE
     lookup = coarse.lookup()
     members = PatchPoints(coarse)
     patches = np.arange(len(members.patches))
-    rays = gather(scene, lookup, members, patches, 1024, seed=7)
+    incidence = Incidence(coarse.points)
+    rays = gather(scene, lookup, members, incidence, patches, 1024, seed=7)
     seen = (coarse.points.seen > 0) & (coarse.points.bounce == 0) & (coarse.patch_of_point >= 0)
     share = np.bincount(coarse.patch_of_point[seen], minlength=coarse.patches.count)
     share = share[members.patches] / share.sum()

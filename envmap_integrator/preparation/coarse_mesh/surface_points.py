@@ -40,6 +40,7 @@ class SurfacePoints:
     normal          [N, 3]  geometric normal, facing the side the point belongs to
     shading_normal  [N, 3]  shading normal of the material, on the same side
     object_id       [N]     dense index of the top-level shape (``ObjectIds``)
+    material        [N]     2 * Dr.Jit's id of the BSDF, + 1 on the back of the surface
     seen            [N]     1 + the sensor's index for a point on a walk from it, 0 on a global line
     turned          [N]     whether a bump or normal map turns the shading normal
     bounce          [N]     which hit of its walk or line it is, from 0
@@ -52,6 +53,7 @@ class SurfacePoints:
     normal: np.ndarray
     shading_normal: np.ndarray
     object_id: np.ndarray
+    material: np.ndarray
     seen: np.ndarray
     turned: np.ndarray
     bounce: np.ndarray
@@ -314,7 +316,8 @@ def _hits_along(
     n_rays, n_hits = dr.width(ray), WALK_HITS if walk else LINE_HITS
     size = n_hits * n_rays
     positions, normals, shading_normals = (dr.zeros(mi.Float, 3 * size) for _ in range(3))
-    object_of_point, reflects = dr.zeros(mi.UInt32, size), dr.zeros(mi.Float, size)
+    object_of_point, material = (dr.zeros(mi.UInt32, size) for _ in range(2))
+    reflects = dr.zeros(mi.Float, size)
     kept, turned = dr.zeros(mi.Bool, size), dr.zeros(mi.Bool, size)
     n_hits_, n_rays_ = dr.opaque(mi.UInt32, n_hits), dr.opaque(mi.UInt32, n_rays)
 
@@ -329,6 +332,7 @@ def _hits_along(
             normals,
             shading_normals,
             object_of_point,
+            material,
             kept,
             turned,
             reflects,
@@ -352,6 +356,8 @@ def _hits_along(
         dr.scatter(normals, normal, index, keep)
         dr.scatter(shading_normals, shading_normal, index, keep)
         dr.scatter(object_of_point, object_ids(si), index, keep)
+        back = dr.select(si.wi.z < 0, mi.UInt32(1), 0)
+        dr.scatter(material, 2 * dr.reinterpret_array(mi.UInt32, bsdf) + back, index, keep)
         dr.scatter(kept, mi.Bool(True), index, keep)
         aligned = dr.abs(dr.dot(shading_normal, si.sh_frame.n))
         dr.scatter(turned, aligned < UNTURNED, index, keep)
@@ -368,7 +374,8 @@ def _hits_along(
         index += n_rays_
         active &= index < n_hits_ * n_rays_
 
-    dr.eval(positions, normals, shading_normals, object_of_point, kept, turned, reflects)
+    dr.eval(positions, normals, shading_normals, object_of_point, material)
+    dr.eval(kept, turned, reflects)
     chosen = np.flatnonzero(kept.numpy())
     position, normal, shading_normal = (
         vectors.numpy().reshape(size, 3)[chosen]
@@ -379,6 +386,7 @@ def _hits_along(
         normal,
         shading_normal,
         object_of_point.numpy()[chosen],
+        material.numpy()[chosen],
         np.full(len(chosen), float(walk), dtype=np.float32),
         turned.numpy()[chosen],
         (chosen // n_rays).astype(np.uint32),

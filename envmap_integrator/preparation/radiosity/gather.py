@@ -6,7 +6,7 @@ based radiosity (Wallace et al. 1987).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -14,7 +14,7 @@ import numpy as np
 
 from ...lookup.lookup import Lookup
 from ...lookup.patches import PARTS
-from ...system.jit import mean_channel, mix, unit, upload
+from ...system.jit import R2, mean_channel, mix, unit, upload
 from ...system.progress import stage
 from ...transport.direct_light import mis_weight
 from ...transport.path import follow
@@ -22,11 +22,12 @@ from ...transport.rules import PathRules
 from ...transport.state import PathStart
 from ..coarse_mesh.patch_points import PatchPoints
 from .direct_light import finite, sample_irradiance
+from .incidence import Incidence
 
-#: Steps of the R2 sequence (Roberts 2018).
-R2 = (0.7548776662466927, 0.5698402909980532)
 #: Gather rays per kernel launch: bounds memory.
 MAX_LANES = 1 << 22
+#: Bounces after which light that has grown shows that it does.
+GROWTH_BOUNCES = 8
 #: Floats that gather rays leave, and the iteration for them.
 FLOATS_PER_RAY = 16
 
@@ -104,6 +105,7 @@ def gather(
     scene: mi.Scene,
     lookup: Lookup,
     members: PatchPoints,
+    incidence: Incidence,
     rank: np.ndarray,
     samples: int,
     seed: int,
@@ -119,7 +121,7 @@ def gather(
         for begin in range(0, len(rank), launch):
             some = rank[begin : begin + launch]
             seed_ = seed + 1 + begin
-            found.append(_gather(scene, lookup, members, some, samples, seed_))
+            found.append(_gather(scene, lookup, members, incidence, some, samples, seed_))
             advance(len(some))
     return GatherRays.concatenate(found)
 
@@ -131,7 +133,7 @@ def block_mean(value: mi.Spectrum | mi.Float, samples: int) -> mi.Spectrum | mi.
     return type(value)(*(dr.block_sum(c, samples) / samples for c in value))
 
 
-def _gather(scene, lookup, members, rank, samples, seed) -> GatherRays:
+def _gather(scene, lookup, members, incidence, rank, samples, seed) -> GatherRays:
     n_lanes = len(rank) * samples
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, n_lanes)
@@ -162,6 +164,7 @@ def _gather(scene, lookup, members, rank, samples, seed) -> GatherRays:
     ds, light = sample_irradiance(scene, lookup.emitters, si, emitter_row, v)
     cosine = dr.maximum(dr.dot(si.sh_frame.n, ds.d), 0)
     direct = light * dr.select(ds.delta, 1, mis_weight(ds.pdf, cosine * dr.inv_pi))
+    direct *= incidence(point, cosine)
 
     start = PathStart(
         ray=si.spawn_ray(direction),
@@ -173,8 +176,9 @@ def _gather(scene, lookup, members, rank, samples, seed) -> GatherRays:
     )
     above = (dr.dot(si.n, direction) > 0) & (wo.z > 0)
     end_ = follow(scene, lookup, PathRules(), sampler, start, above)
-    direct += dr.pi * end_.direct
-    escaped = dr.pi * (end_.radiance - end_.direct)
+    counts = incidence(point, wo.z)
+    direct += dr.pi * counts * end_.direct
+    escaped = dr.pi * counts * (end_.radiance - end_.direct)
 
     def each(function, x):
         return type(x)(*(function(component) for component in x))
@@ -184,11 +188,12 @@ def _gather(scene, lookup, members, rank, samples, seed) -> GatherRays:
     dropped = dr.select(above | ~members.points.is_turned(point), mi.Float(0), 1)
     kept = 1 - block_mean(dropped, samples)
     scale = dr.repeat(dr.select(kept > 0, dr.rcp(kept), 0), samples)
-    direct, escaped, weight = (each(finite, scale * x) for x in (direct, escaped, end_.weight))
+    direct, escaped, weight = (
+        each(finite, scale * x) for x in (direct, escaped, counts * end_.weight)
+    )
     of_emitters, of_others = mean_channel(direct), mean_channel(escaped)
     # Block sums evaluate what they sum up: without this, each of them would trace all rays anew.
     dr.eval(direct, escaped, of_emitters, of_others, weight, end_.row, end_.place, start_place)
-    weight *= dr.repeat(_excess(weight, samples), samples)
     direct, escaped = block_mean(direct, samples), block_mean(escaped, samples)
     dr.eval(direct, escaped, weight)
     return GatherRays(
@@ -196,18 +201,33 @@ def _gather(scene, lookup, members, rank, samples, seed) -> GatherRays:
     )
 
 
-def _excess(weight: mi.Spectrum, samples: int) -> mi.Float:
-    """Factor [1] for the throughputs of each block, below 1 where they'd bring more than all light.
+def without_growth(
+    rays: GatherRays, blocks: Blocks, patch: np.ndarray, n_patches: int
+) -> GatherRays:
+    """The rays, with smaller throughputs where light would grow from bounce to bounce.
 
     No patch receives more than what the others reflect, unless by noise: few rays met heavy weights
-    of a material. In a narrow vase, which sees itself, the solution would grow without end. Such
-    blocks get as much as all blocks do on average.
+    of a material. In a room that averages out; in a narrow vase, which sees itself, the solution
+    would grow without end. There, blocks that bring more than all light get as much as all blocks
+    do on average. ``patch`` [K] are those of the blocks, of ``n_patches``.
     """
-    whole = dr.max(block_mean(weight, samples))
-    dr.eval(whole)
-    n_blocks = dr.opaque(mi.Float, dr.width(whole))
-    usual = dr.sum(dr.minimum(whole, 1)) / n_blocks
-    return dr.select(whole > 1, usual / whole, 1)
+    light = dr.ones(mi.Float, len(mi.Spectrum()) * n_patches)
+    place = upload(mi.UInt32, patch)
+    for _ in range(GROWTH_BOUNCES):
+        arriving = rays.weight * dr.gather(mi.Spectrum, light, rays.row >> 1)
+        dr.eval(arriving)
+        found = blocks.mean(block_mean(arriving, rays.samples))
+        light = dr.zeros(mi.Float, dr.width(light))
+        dr.scatter(light, found, place)
+        dr.eval(light)
+    grows = dr.gather(mi.Bool, dr.max(found) > 1, upload(mi.UInt32, blocks.rank))
+    whole = dr.max(block_mean(rays.weight, rays.samples))
+    dr.eval(grows, whole)
+    usual = dr.sum(dr.minimum(whole, 1)) / dr.opaque(mi.Float, dr.width(whole))
+    factor = dr.select(grows & (whole > 1), usual / whole, 1)
+    weight = rays.weight * dr.repeat(factor, rays.samples)
+    dr.eval(weight)
+    return replace(rays, weight=weight)
 
 
 def _rotated(x, y, block, seed) -> mi.Point2f:

@@ -19,7 +19,8 @@ from ...system.jit import give_back, upload
 from ...system.progress import stage
 from ..coarse_mesh.mesh import CoarseMesh
 from ..coarse_mesh.patch_points import PatchPoints
-from .gather import FLOATS_PER_RAY, Blocks, GatherRays, block_mean, gather
+from .gather import FLOATS_PER_RAY, Blocks, GatherRays, block_mean, gather, without_growth
+from .incidence import Incidence
 from .noise import Noise, cache_noise
 
 #: Relative change of the irradiance at which the solution counts as converged, on the mean of all
@@ -80,13 +81,16 @@ def solve_irradiance(
         cache = IrradianceCache(lookup.patches, table, dr.zeros(mi.Float, n_patches))
         return Solution(cache, None, np.zeros(n_patches), no_cell)
 
+    incidence = Incidence(mesh.points)
+
     def send(rank, seed):
-        return gather(scene, lookup, members, rank, samples, seed)
+        return gather(scene, lookup, members, incidence, rank, samples, seed)
 
     rank = np.arange(n_used)
     for further in range(len(MORE) + 1):
         rays = send(rank, seed + further * SEED_STEP)
         blocks = Blocks(rank, n_used)
+        rays = without_growth(rays, blocks, members.patches, n_patches)
         cache = IrradianceCache(lookup.patches, _solve(n_patches, members.patches, rays, blocks))
         noise = cache_noise(rays, blocks, cache, members)
         steep = noise.steep & (may_divide and further < len(MORE))
