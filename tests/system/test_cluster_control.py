@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import pytest
 
-from envmap_integrator.cli.scene_file import SceneFile
+from envmap_integrator.system.scene_file import SceneFile
 from tests.helpers import cluster, integrator, load, picture, room
 
 pytestmark = pytest.mark.usefixtures("variant")
