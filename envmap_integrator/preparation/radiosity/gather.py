@@ -211,6 +211,10 @@ def without_growth(
     would grow without end. There, blocks that bring more than all light get as much as all blocks
     do on average. ``patch`` [K] are those of the blocks, of ``n_patches``.
     """
+    whole = dr.max(block_mean(rays.weight, rays.samples))
+    dr.eval(whole)
+    if not dr.any(whole > 1):
+        return rays
     light = dr.ones(mi.Float, len(mi.Spectrum()) * n_patches)
     place = upload(mi.UInt32, patch)
     for _ in range(GROWTH_BOUNCES):
@@ -221,8 +225,6 @@ def without_growth(
         dr.scatter(light, found, place)
         dr.eval(light)
     grows = dr.gather(mi.Bool, dr.max(found) > 1, upload(mi.UInt32, blocks.rank))
-    whole = dr.max(block_mean(rays.weight, rays.samples))
-    dr.eval(grows, whole)
     usual = dr.sum(dr.minimum(whole, 1)) / dr.opaque(mi.Float, dr.width(whole))
     factor = dr.select(grows & (whole > 1), usual / whole, 1)
     weight = rays.weight * dr.repeat(factor, rays.samples)
