@@ -92,7 +92,7 @@ def _compare(view: View, options: Options) -> Report:
     return Report(
         name=f"workers-{view.name}",
         title=f"{view.name} by workers",
-        settings=asdict(options) | {"scene": str(view.path), "integrator": INTEGRATOR},
+        settings=asdict(options) | {"scene": view, "integrator": INTEGRATOR},
         findings=[
             "All pictures are the same to the bit." if same else "The pictures DIFFER.",
             f"A scheduler takes {empty:.0f} calls a second, of workers in its own process.",
