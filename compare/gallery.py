@@ -23,6 +23,7 @@ from compare.metrics import Picture
 from compare.scene_kit import Description
 from envmap_integrator.cli.errors import condense
 from envmap_integrator.registration import PLUGINS
+from envmap_integrator.system.warned import warned
 
 INTEGRATORS = tuple(
     name
@@ -221,22 +222,8 @@ def _judge_error(case: Case, integrator: str) -> Verdict:
 @contextmanager
 def listening() -> Iterator[list[str]]:
     """Collect the warnings that Mitsuba and Python give meanwhile, repeated ones too."""
-    heard: list[str] = []
-
-    class Listener(mi.Appender):
-        def append(self, level, text):
-            if level >= mi.LogLevel.Warn:
-                heard.append(text)
-
-        def log_progress(self, *progress):
-            pass
-
-    listener = Listener()
-    mi.logger().add_appender(listener)
-    try:
+    with warned() as heard:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             yield heard
         heard += [str(warning.message) for warning in caught]
-    finally:
-        mi.logger().remove_appender(listener)

@@ -125,9 +125,7 @@ def build_parser() -> argparse.ArgumentParser:
         epilog=RENDER_EXAMPLES + EXIT_CODES,
     )
     _add_scene_options(render)
-    render.add_argument(
-        "-s", "--sensor", type=int, default=0, metavar="INDEX", help="in the scene's order, from 0"
-    )
+    _add_sensor(render)
     render.add_argument("-o", "--output", type=Path, help="default: beside the scene, .exr")
     render.add_argument(
         "--spp", type=int, default=0, help="samples per pixel, default: the scene's"
@@ -179,9 +177,7 @@ def build_parser() -> argparse.ArgumentParser:
         epilog=INSPECT_EXAMPLES + EXIT_CODES,
     )
     _add_scene_options(inspect)
-    inspect.add_argument(
-        "-s", "--sensor", type=int, default=0, metavar="INDEX", help="in the scene's order, from 0"
-    )
+    _add_sensor(inspect)
     inspect.add_argument("-o", "--output", type=Path, help="default: beside the scene, .html")
     inspect.add_argument(
         "--spp", type=int, default=0,
@@ -212,6 +208,12 @@ def build_parser() -> argparse.ArgumentParser:
     check.add_argument("--debug", action="store_true", help=argparse.SUPPRESS)
     check.set_defaults(command=doctor)
     return parser
+
+
+def _add_sensor(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "-s", "--sensor", type=int, default=0, metavar="INDEX", help="in the scene's order, from 0"
+    )
 
 
 def _add_scene_options(parser: argparse.ArgumentParser) -> None:

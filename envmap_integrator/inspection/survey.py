@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import groupby, islice
 
@@ -19,6 +17,7 @@ from ..lookup.ids import ObjectIds
 from ..lookup.patches import DROPPED, MARK_BITS, UNEVEN
 from ..preparation.baked_state import BakedState
 from ..system.scene_order import ordered_shapes
+from ..system.warned import warned
 
 #: Samples per pixel of the picture, in two passes, and of the AOVs.
 PICTURE_SPP, AOV_SPP = 16, 4
@@ -88,7 +87,7 @@ def survey(
 
     Raises ``ValueError`` as ``integrator.prepare`` does.
     """
-    with _warnings() as warnings:
+    with warned() as warnings:
         each, begin = max(min(PICTURE_SPP, spp) // 2, 1), time.perf_counter()
         for better in islice(integrator.progressive(scene, sensor, seed, each, spp), 2):
             picture, reached, noise = np.array(better.picture), better.spp, better.error
@@ -176,24 +175,3 @@ def _clusters(scene, sensor, state: BakedState, served: np.ndarray) -> list[Clus
             )
         )
     return found
-
-
-@contextmanager
-def _warnings() -> Iterator[list[str]]:
-    """What Mitsuba warns of in the block, which it still prints."""
-    found: list[str] = []
-
-    class Appender(mi.Appender):
-        def append(self, level, text):
-            if level >= mi.LogLevel.Warn:
-                found.append(text)
-
-        def log_progress(self, *_):
-            pass
-
-    appender = Appender()
-    mi.logger().add_appender(appender)
-    try:
-        yield found
-    finally:
-        mi.logger().remove_appender(appender)

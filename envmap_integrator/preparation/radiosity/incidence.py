@@ -27,9 +27,9 @@ class Incidence:
     """How much light from a direction counts at surface points: a(w) / ā."""
 
     def __init__(self, points: SurfacePoints):
-        materials, row = np.unique(points.material, return_inverse=True)
-        self._row = upload(mi.UInt32, row)
-        self._table = _table(materials)
+        used = np.bincount(points.material) > 0  # Ids are small: no need to sort them.
+        self._row = upload(mi.UInt32, (np.cumsum(used) - 1)[points.material])
+        self._table = upload(mi.Float, _table(np.flatnonzero(used)))
 
     def __call__(self, point: mi.UInt32, cosine: mi.Float) -> mi.Float:
         """Factor [1] for light that arrives at ``cosine`` to the shading normal of a point."""
@@ -38,8 +38,20 @@ class Incidence:
         return dr.gather(mi.Float, self._table, row * STEPS + step)
 
 
-def _table(materials: np.ndarray) -> mi.Float:
-    """a(w) / ā [M * STEPS] of M materials; 1 for diffuse ones, and where that can't be told."""
+def _table(materials: np.ndarray) -> np.ndarray:
+    """a(w) / ā [M, STEPS] of M materials; 1 for diffuse ones, and where that can't be told."""
+    bsdf = dr.reinterpret_array(mi.BSDFPtr, upload(mi.UInt32, materials // 2))
+    several = (is_diffuse(bsdf) & ~single_lobe(bsdf)).numpy()
+    table = np.ones((len(materials), STEPS))
+    if several.any():
+        reflected = _reflected(materials[several])
+        mean = reflected.mean(axis=1, keepdims=True)
+        table[several] = np.where(mean > 0, reflected / np.maximum(mean, 1e-30), 1)
+    return table
+
+
+def _reflected(materials: np.ndarray) -> np.ndarray:
+    """a(w) [M, STEPS] of M materials, but for a factor."""
     samples = min(max(ALL_SAMPLES // max(STEPS * len(materials), 1), 1), SAMPLES)
     samples = 1 << int(np.log2(samples))
     lane = dr.arange(mi.UInt32, len(materials) * STEPS * samples)
@@ -49,7 +61,6 @@ def _table(materials: np.ndarray) -> mi.Float:
     # ---- A surface of each material, lit from a direction of each step ----
     material = dr.gather(mi.UInt32, upload(mi.UInt32, materials), row)
     bsdf = dr.reinterpret_array(mi.BSDFPtr, material // 2)
-    several = is_diffuse(bsdf) & ~single_lobe(bsdf)
     u, v = (mi.Float(k) * r - dr.floor(mi.Float(k) * r) for r in R2)
     cosine = dr.sqrt((mi.Float(step) + u) / STEPS)
     sine, azimuth = dr.safe_sqrt(1 - dr.square(cosine)), dr.two_pi * mi.radical_inverse_2(k, 0)
@@ -63,13 +74,11 @@ def _table(materials: np.ndarray) -> mi.Float:
     # ---- What it reflects ----
     lobe = (mi.Float(k) + 0.5) / mi.Float(samples_)
     place = mi.Point2f(v, mi.radical_inverse_2(k, 1))
-    bs, weight = bsdf.sample(mi.BSDFContext(), si, lobe, place, several)
+    bs, weight = bsdf.sample(mi.BSDFContext(), si, lobe, place)
     scattered = Scattered.of(si, bs, weight)
     # Whether the cache serves a direction is asked from where it's looked at.
     w, si.wi = mi.Vector3f(si.wi), bs.wo
-    wide = is_wide(si, w, bsdf.pdf(mi.BSDFContext(), si, w, several)) & ~scattered.specular
-    reflected = dr.select(several & wide, mean_channel(scattered.weight), 0)
+    wide = is_wide(si, w, bsdf.pdf(mi.BSDFContext(), si, w)) & ~scattered.specular
+    reflected = dr.select(wide, mean_channel(scattered.weight), 0)
     reflected = dr.block_sum(dr.select(dr.isfinite(reflected), reflected, 0), samples).numpy()
-    reflected = reflected.reshape(len(materials), STEPS).astype(np.float64)
-    mean = reflected.mean(axis=1, keepdims=True)
-    return upload(mi.Float, np.where(mean > 0, reflected / np.maximum(mean, 1e-30), 1))
+    return reflected.reshape(len(materials), STEPS).astype(np.float64)
