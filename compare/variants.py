@@ -60,14 +60,14 @@ def patches_unblended() -> AbstractContextManager:
 @contextmanager
 def only_diffuse_is_wide() -> Iterator[None]:
     """Irradiance stands for no lobe but those that are diffuse; all others are traced on."""
-    is_wide = lobes.is_wide
+    wide_share = lobes.wide_share
 
-    def is_diffuse(si, wo, pdf):
-        return is_wide(si, wo, pdf) & lobes.only_wide(si.bsdf())
+    def of_diffuse(bsdf, si, wo, pdf):
+        return dr.select(lobes.only_wide(bsdf), wide_share(bsdf, si, wo, pdf), 0)
 
     with (
-        patch.object(lobes, "is_wide", is_diffuse),
-        patch.object(direct_light, "is_wide", is_diffuse),
+        patch.object(lobes, "wide_share", of_diffuse),
+        patch.object(direct_light, "wide_share", of_diffuse),
     ):
         yield
 

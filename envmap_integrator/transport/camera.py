@@ -167,7 +167,8 @@ def follow_mirrors(
     while dr.hint(active, label="Follow mirrors"):
         emitted += throughput * si.emitter(scene).eval(si, active)
         u, v = sampler.next_1d(), sampler.next_2d()
-        scattered = Scattered.of(si, *si.bsdf(ray).sample(mi.BSDFContext(), si, u, v, active))
+        bsdf = si.bsdf(ray)
+        scattered = Scattered.of(bsdf, si, *bsdf.sample(mi.BSDFContext(), si, u, v, active))
         bs = scattered.bs
         solid |= active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         throughput[active] *= scattered.weight
@@ -234,9 +235,9 @@ def leave(
     lookup: Lookup, sampler: mi.Sampler, vertex: Vertex, u: mi.Float, active: mi.Bool
 ) -> tuple[PathStart, Scattered]:
     """Start of a secondary ray from a camera hit, and the direction that the material sampled."""
-    si = vertex.si
+    bsdf, si = vertex.bsdf, vertex.si
     scattered = Scattered.of(
-        si, *vertex.bsdf.sample(mi.BSDFContext(), si, u, sampler.next_2d(), active)
+        bsdf, si, *bsdf.sample(mi.BSDFContext(), si, u, sampler.next_2d(), active)
     )
     bs = scattered.bs
     start = PathStart(

@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from ..lookup.emitter_choice import EmitterChoice
 from ..system.ray_counts import Ray, count
-from .lobes import is_wide
+from .lobes import wide_share
 from .vertex import Vertex
 
 
@@ -56,16 +56,18 @@ def reflected(
     many parameters, as ``bsdf.eval_pdf`` is called here or together with ``bsdf.sample``.)
     """
     si = vertex.si
-    wide = is_wide(si, si.to_local(ds.d), bsdf_pdf)
-    alone = wide & share.alone
+    alone = mi.Bool(share.alone)
     if vertex.cube is not None:
         # The distance of an environment is made up.
         infinite = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
         beyond = infinite | (vertex.cube.exit(si.p, ds.d) < ds.dist)
-        alone |= wide & vertex.cube.valid & beyond
-    mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, dr.select(alone, 0, bsdf_pdf)))
-    light = bsdf_value * em_weight * mis * dr.select(wide, share.boost, 1)
-    active = active & (ds.pdf != 0) & ~(wide & share.lit) & (dr.max(light) > 0)
+        alone |= vertex.cube.valid & beyond
+    wide = wide_share(vertex.bsdf, si, si.to_local(ds.d), bsdf_pdf)
+    of_wide = dr.select(share.lit, 0, wide * share.boost)
+    of_wide *= dr.select(ds.delta, 1, mis_weight(ds.pdf, dr.select(alone, 0, bsdf_pdf)))
+    of_others = (1 - wide) * dr.select(ds.delta, 1, mis_weight(ds.pdf, bsdf_pdf))
+    light = bsdf_value * em_weight * (of_wide + of_others)
+    active = active & (ds.pdf != 0) & (dr.max(light) > 0)
     ray = si.spawn_ray_to(ds.p)
     count(Ray.SHADOW, ray, active)
     active &= ~scene.ray_test(ray, active)

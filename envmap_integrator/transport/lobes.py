@@ -7,10 +7,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-#: Directions sampled more densely than this [1/sr] belong to a lobe for which a Lambertian
-#: stand-in would misplace the light: they are traced on instead of read from the cache.
-#: (A cosine lobe has 0.32 at most.)
-NARROW_PDF = 1.0
+from ..system.jit import mix, unit
+
 #: Choices among the lobes of a surface that the cache serves: those that it can't stand for, such
 #: as the gloss of a varnish, are found as many times more often as if one choice were made.
 LOBE_CHOICES = 4
@@ -46,13 +44,21 @@ def only_wide(bsdf: mi.BSDFPtr) -> mi.Bool:
     return (flags & int(narrow)) == 0
 
 
-def is_wide(si: mi.SurfaceInteraction3f, wo: mi.Vector3f, pdf: mi.Float) -> mi.Bool:
-    """Is light from ``wo`` reflected by a lobe so wide that cached irradiance may stand for it?
+def wide_share(
+    bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, pdf: mi.Float
+) -> mi.Float:
+    """Part [1] of the light reflected from ``wo`` for which cached irradiance may stand.
 
-    ``wo`` is in the local frame, ``pdf`` [1/sr] the density with which the material samples it. The
-    cache holds the side that the path arrived on: transmission never qualifies.
+    ``wo`` is in the local frame, ``pdf`` [1/sr] the density with which the material samples it. As
+    much as a cosine lobe would sample belongs to wide lobes, what exceeds it to gloss. (Gloss is
+    brightest at grazing angles, where cosine lobes sample least: no single density tells the two
+    apart.) Without gloss all is wide, also where bumps turn the cosine. The cache holds the side
+    that the path arrived on: transmission never qualifies.
     """
-    return (pdf <= NARROW_PDF) & (mi.Frame3f.cos_theta(si.wi) * mi.Frame3f.cos_theta(wo) > 0)
+    cosine = mi.Frame3f.cos_theta(wo)
+    wide = dr.abs(cosine) * dr.inv_pi
+    share = dr.select(only_wide(bsdf) | (pdf <= wide), 1, wide / pdf)
+    return dr.select(mi.Frame3f.cos_theta(si.wi) * cosine > 0, share, 0)
 
 
 @dataclass
@@ -71,7 +77,9 @@ class Scattered:
     wide: mi.Bool
 
     @staticmethod
-    def of(si: mi.SurfaceInteraction3f, bs: mi.BSDFSample3f, weight: mi.Spectrum) -> Scattered:
+    def of(
+        bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, bs: mi.BSDFSample3f, weight: mi.Spectrum
+    ) -> Scattered:
         """A direction that a material has sampled.
 
         Broken meshes have shading normals that are no numbers. Rays along such hit nothing, as if
@@ -79,7 +87,10 @@ class Scattered:
         """
         weight = dr.select(dr.squared_norm(si.to_world(bs.wo)) > 0, weight, 0)
         specular = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        return Scattered(bs, weight, specular, is_wide(si, bs.wo, bs.pdf) & ~specular)
+        # Any random bits do to tell which lobe a direction is of.
+        u = unit(mix(dr.reinterpret_array(mi.UInt32, bs.wo.x)))
+        wide = (u < wide_share(bsdf, si, bs.wo, bs.pdf)) & ~specular
+        return Scattered(bs, weight, specular, wide)
 
 
 @dr.syntax
@@ -104,7 +115,9 @@ def choose_lobes(
     u = sampler.next_1d()
     while dr.hint(active, exclude=[bsdf, si, residual], label="Choose lobes"):
         lobe = (mi.Float(i) + u) / count
-        one = Scattered.of(si, *bsdf.sample(mi.BSDFContext(), si, lobe, sampler.next_2d(), active))
+        one = Scattered.of(
+            bsdf, si, *bsdf.sample(mi.BSDFContext(), si, lobe, sampler.next_2d(), active)
+        )
         cached += dr.select(one.wide, one.weight, 0)
         chance = dr.select(one.wide, dr.select(residual, mi.Float(1), 0), count - 1)
         chance = dr.select(dr.max(one.weight) > 0, chance, 0)

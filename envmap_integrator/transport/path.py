@@ -165,7 +165,7 @@ def direct_light(
         light, bs, weight = sample_with_emitter(
             scene, lookup.emitters, vertex, share, sampler, active
         )
-    return light, Scattered.of(si, bs, weight)
+    return light, Scattered.of(vertex.bsdf, si, bs, weight)
 
 
 def scatter(

@@ -212,7 +212,7 @@ def test_replaced_approximations_are_put_back():
 
     def replaceable():
         far_field, lobes = variants.FarField, variants.lobes
-        return far_field.eval, far_field._inverse_distance, variants.Patches.find, lobes.is_wide
+        return far_field.eval, far_field._inverse_distance, variants.Patches.find, lobes.wide_share
 
     before = replaceable()
     for variant in variants.variants(patches=256, finer=4).values():

@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...system.jit import R2, mean_channel, upload
-from ...transport.lobes import Scattered, is_diffuse, is_wide, single_lobe
+from ...transport.lobes import Scattered, is_diffuse, single_lobe, wide_share
 from ..coarse_mesh.surface_points import SurfacePoints
 
 #: Steps of the squared cosine, all of which as much of an even illumination comes from.
@@ -75,10 +75,10 @@ def _reflected(materials: np.ndarray) -> np.ndarray:
     lobe = (mi.Float(k) + 0.5) / mi.Float(samples_)
     place = mi.Point2f(v, mi.radical_inverse_2(k, 1))
     bs, weight = bsdf.sample(mi.BSDFContext(), si, lobe, place)
-    scattered = Scattered.of(si, bs, weight)
-    # Whether the cache serves a direction is asked from where it's looked at.
+    scattered = Scattered.of(bsdf, si, bs, weight)
+    # What the cache stands for is asked from where it's looked at.
     w, si.wi = mi.Vector3f(si.wi), bs.wo
-    wide = is_wide(si, w, bsdf.pdf(mi.BSDFContext(), si, w)) & ~scattered.specular
-    reflected = dr.select(wide, mean_channel(scattered.weight), 0)
+    wide = wide_share(bsdf, si, w, bsdf.pdf(mi.BSDFContext(), si, w))
+    reflected = dr.select(scattered.specular, 0, wide * mean_channel(scattered.weight))
     reflected = dr.block_sum(dr.select(dr.isfinite(reflected), reflected, 0), samples).numpy()
     return reflected.reshape(len(materials), STEPS).astype(np.float64)
