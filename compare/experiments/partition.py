@@ -20,15 +20,16 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
+from matplotlib.figure import Figure
 
 from compare.experiments.complexity import ATRIUM_GROUP
 from compare.figures import panels
-from compare.metrics import Thirds, error_floor, estimate
+from compare.metrics import Picture, Thirds, error_floor, estimate
 from compare.options import JudgedOptions, existing, option
 from compare.part_worker import Job, shape_order
 from compare.parts import Box, Size, single_triangles, whole_shapes, write_part
 from compare.references import reference
-from compare.regions import Mask, within
+from compare.regions import Mask, crop, within
 from compare.report import Illustration, Report, Table
 from compare.runs import Measurements, Task, interleave
 from compare.scenes import HYBRID, ONE_LEVEL_PATH, OWN_SCENES, Subject, View
@@ -340,17 +341,6 @@ def _report(prepared: Prepared, options: Options, folder: Path) -> Report:
 
     errors = _errors(owners, masks, pictures, truth.thirds)
     judged = _judged(workers, masks[index], truth.thirds)
-    shown = np.zeros((*masks[index].shape, 3), np.float32)
-
-    def picture(outcome: Outcome) -> np.ndarray:
-        whole = shown.copy()
-        whole[masks[index]] = np.mean(outcome.pictures, axis=0)[0]
-        return whole
-
-    shown_errors = {
-        name: _over(picture(outcome), truth.picture, masks[index])
-        for name, outcome in workers.items()
-    }
     suffix = "-listed" if options.clusters == "listed" else ""
     return Report(
         name=f"partition-{view.name}{suffix}",
@@ -366,14 +356,8 @@ def _report(prepared: Prepared, options: Options, folder: Path) -> Report:
         figures=[
             Illustration(
                 "workers",
-                f"The pixels of {owners[index].name}, by path and by workers.",
-                panels(
-                    {"path": np.where(masks[index][..., None], truth.picture, 0)}
-                    | {name: picture(outcome) for name, outcome in workers.items()},
-                    truth.picture,
-                    shown_errors,
-                    columns=5,
-                ),
+                f"The pixels of {owners[index].name}, by path and by workers, and their errors.",
+                _pictures(workers, masks[index], truth.picture),
             )
         ],
         numbers={
@@ -389,9 +373,15 @@ def _report(prepared: Prepared, options: Options, folder: Path) -> Report:
     )
 
 
-def _over(picture: np.ndarray, reference_: np.ndarray, mask: Mask) -> np.ndarray:
-    """A picture of some pixels, the others as in the reference, so that no error shows there."""
-    return np.where(mask[..., None], picture, reference_)
+def _pictures(workers: dict[str, Outcome], mask: Mask, truth: Picture) -> Figure:
+    """The part of the picture that shows the workers' pixels; all else as by path."""
+    found = {}
+    for name, outcome in workers.items():
+        picture = truth.copy()
+        picture[mask] = np.mean(outcome.pictures, axis=0)[0]
+        found[name] = crop(picture, mask)
+    seen = crop(truth, mask)
+    return panels({"path": seen} | found, seen, found, columns=len(found) + 1)
 
 
 def _errors(
