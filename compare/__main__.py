@@ -17,6 +17,7 @@ from compare.experiments import (
     error_vs_time,
     flicker,
     gallery,
+    partition,
     render,
     resolution,
     workers,
@@ -36,6 +37,7 @@ EXPERIMENTS: dict[str, ModuleType] = {
     "gallery": gallery,
     "render": render,
     "workers": workers,
+    "partition": partition,
 }
 """Each module has ``Options`` and ``run(options, folder)``; its docstring is the help."""
 

@@ -42,6 +42,7 @@ TINY = {
     "bias": {"spp": 4, "patches": 256, "finer": 4},
     "flicker": {"spp": 4, "frames": 3, "degrees": 1.0},
     "render": {"spp": 4},
+    "partition": {"spp": 4},
     "workers": {"spp": 4, "workers": (1,), "sleepers": (2,), "seconds": 0.5},
 }
 
