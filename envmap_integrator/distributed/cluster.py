@@ -71,9 +71,8 @@ def local(n_workers: int, n_threads: int) -> Iterator[Client]:
     ):
         try:
             yield client
-        except KeyboardInterrupt:
+        finally:
             _kill(cluster)
-            raise
 
 
 def _kill(cluster: LocalCluster) -> None:

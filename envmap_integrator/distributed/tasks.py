@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -31,8 +32,8 @@ def results(
 ) -> Iterator[tuple[int, Any]]:
     """The values of ``function(*call)`` for all calls, each once, with their indices, as they end.
 
-    Where a worker answers that it lacks something, the call is sent again with ``lacking(index)``
-    as its last argument.
+    Calls that are appended while it's used are done as well. Where a worker answers that it lacks
+    something, the call is sent again with ``lacking(index)`` as its last argument.
 
     What a worker had that died, hung or ran out of memory is done again by another one. Raises
     ``RuntimeError``, in one line, if workers report a fault, or die or hang at the same call again
@@ -40,9 +41,11 @@ def results(
     """
     crew = _Crew(client, function, calls, time_limit, lacking)
     try:
-        for index in range(len(calls)):
-            crew.submit(index)
-        while crew.pending:
+        sent = 0
+        while crew.pending or sent < len(calls):
+            for index in range(sent, len(calls)):
+                crew.submit(index)
+            sent = len(calls)
             yield from crew.arrived()
             crew.look_after_workers()
     finally:
@@ -62,7 +65,7 @@ class _Crew:
         self.client, self.function, self.calls = client, function, calls
         self.time_limit, self.lacking = time_limit, lacking
         self.pending: dict[int, Future] = {}
-        self.tries = [0] * len(calls)
+        self.tries: Counter[int] = Counter()
         self.since: dict[str, float] = {}
         self.hung: set[str] = set()
         self.last_look = self.last_worker = time.monotonic()
@@ -170,7 +173,7 @@ class _Crew:
             self._again(index, f"worker {worker}: no result within {self.time_limit:g} s")
 
     def _workers(self) -> set[str]:
-        return set(self.client.scheduler_info()["workers"])
+        return set(self.client.scheduler_info(n_workers=-1)["workers"])
 
     def dismiss(self) -> None:
         """Forget what hasn't ended."""

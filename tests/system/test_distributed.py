@@ -19,8 +19,9 @@ import pytest
 from distributed import Client, LocalCluster, Status
 
 from envmap_integrator.cli import main
-from envmap_integrator.distributed import cluster, render, tasks
+from envmap_integrator.distributed import cluster, progressive, render, tasks
 from envmap_integrator.distributed.job import Job, View
+from envmap_integrator.distributed.progressive import progressive_distributed
 from envmap_integrator.distributed.render import check_workers, render_distributed, render_views
 from envmap_integrator.imaging.film import pixel_ranges
 from envmap_integrator.system.scene_file import SceneFile
@@ -74,8 +75,9 @@ def by_workers(client, **more) -> np.ndarray:
 def many_parts(monkeypatch):
     """Renders are cut into about 25 parts."""
     with monkeypatch.context() as patch:
-        patch.setattr(render, "LEAST_SAMPLES", MANY_PARTS)
-        patch.setattr(render, "MOST_SAMPLES", MANY_PARTS)
+        for module in (render, progressive):
+            patch.setattr(module, "LEAST_SAMPLES", MANY_PARTS)
+            patch.setattr(module, "MOST_SAMPLES", MANY_PARTS)
         yield
 
 
@@ -171,14 +173,46 @@ def test_several_views(client, at_once):
     assert not np.array_equal(pictures[1], pictures[0])
 
 
-def test_in_the_shell(in_one_process, tmp_path, capsys):
+def test_better_and_better_pictures(client, tmp_path, monkeypatch):
+    """All of them, and what is kept to go on from, whoever has begun with it."""
+    scene_file = SceneFile(SCENE, PARAMETERS)
+    scene_file.configure_integrator("envmap_hybrid", SETTINGS)
+    scene = scene_file.load(merge_meshes=False)
+    here, there = tmp_path / "here.exr", tmp_path / "there.exr"
+    passes = {"seed": 3, "spp": 4, "total": SPP}
+    expected = scene.integrator().progressive(scene, progress_file=here, **passes)
+    expected = [(better.spp, better.error, better.picture.numpy()) for better in expected]
+    halfway = scene.integrator().progressive(scene, progress_file=there, **passes)
+    found = [next(halfway), next(halfway)]
+    halfway.close()
+    with many_parts(monkeypatch):
+        rest = progressive_distributed(
+            SCENE, client, integrator="envmap_hybrid", settings=SETTINGS, parameters=PARAMETERS,
+            progress_file=there, resume=True, **passes,
+        )  # fmt: skip
+        assert next(rest).spp == found[1].spp  # What there is already.
+        found += rest
+    assert [(better.spp, better.error) for better in found] == [(n, e) for n, e, _ in expected]
+    for better, (_, _, picture) in zip(found, expected, strict=True):
+        assert np.array_equal(better.picture.numpy(), picture)
+    assert here.read_bytes() == there.read_bytes()
+
+
+@pytest.mark.parametrize("progressive", [False, True])
+def test_in_the_shell(in_one_process, tmp_path, capsys, progressive):
     options = [arg for key, value in PARAMETERS.items() for arg in ("-D", f"{key}={value}")]
     options += ["--integrator", "envmap_hybrid", "--set", "patches=1024"]
     options += ["--spp", str(SPP), "--seed", "3", "--workers", "1"]
+    options += ["--progressive"] if progressive else []
     output = tmp_path / "room.exr"
     assert main(["render", str(SCENE), *options, "-o", str(output)]) == 0
-    assert "find workers" in capsys.readouterr().out
-    assert np.array_equal(np.array(mi.Bitmap(str(output))), in_one_process[1])
+    told = capsys.readouterr().out
+    assert "find workers" in told
+    if progressive:  # Another sequence of samples.
+        assert told.startswith("16 samples per pixel, ") and f"{SPP} samples per pixel, " in told
+        assert mi.Bitmap(str(output)).size() == (80, 60)
+    else:
+        assert np.array_equal(np.array(mi.Bitmap(str(output))), in_one_process[1])
 
 
 def test_ctrl_c(tmp_path):

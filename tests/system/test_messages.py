@@ -365,7 +365,7 @@ class Ended:
 def crew(workers: dict | None = None, **client: object) -> tasks._Crew:
     """One that has sent a single call to a cluster that isn't there."""
     here = {"status": "running", "scheduler": SimpleNamespace(address="tcp://here:1")}
-    here["scheduler_info"] = lambda: {"workers": workers or {}}
+    here["scheduler_info"] = lambda n_workers: {"workers": workers or {}}
     sent = tasks._Crew(SimpleNamespace(**here | client), None, [()], 9.0, None)
     sent.pending[0] = Ended()
     return sent
@@ -679,10 +679,6 @@ CASES = {
     "another sensor": Case(no_such_sensor, "sensor 3", "the scene has 1", "count from 0"),
     "no Dask": Case(without_dask, "Dask", "is missing", "pip install distributed"),
     "no workers": Case(shell(commands.render, workers=0), "--workers", "0", "must be at least 1"),
-    "workers and progress": Case(
-        shell(commands.render, integrator="envmap_hybrid", workers=2, time=1.0),
-        "--workers", "one picture", "leave out --progressive, --time and --target-error",
-    ),
     "nothing to bake": Case(
         shell(commands.bake), "integrator", '"path"', "pass --integrator envmap_hybrid"
     ),
