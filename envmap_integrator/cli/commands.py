@@ -33,6 +33,7 @@ def render(args: argparse.Namespace) -> int:
     output = args.output or args.scene.with_suffix(".exr")
     check_output(output, hint=" (--png adds a PNG)")
     _require(args.spp >= 0, f"--spp must not be negative, got {args.spp}")
+    _require(not args.tls or args.cluster is not None, "--tls is for --cluster: leave it out")
     _configure_machine(args)
     seconds: dict[str, float] = {}
     with record_kernels():

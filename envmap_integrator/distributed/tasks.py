@@ -74,7 +74,7 @@ class _Crew:
 
     def submit(self, index: int, *more: Any) -> None:
         """Send a call, with ``more`` arguments, to any worker that isn't hung."""
-        others = self._workers() - self.hung if self.hung else None
+        others = self._workers().keys() - self.hung if self.hung else None
         future = self.client.submit(
             self.function,
             *self.calls[index],
@@ -151,9 +151,16 @@ class _Crew:
         self.last_look = now
         if self.client.status != "running":
             raise RuntimeError(f"{_address(self.client)}: the scheduler is gone; start it again")
-        if self._workers() - self.hung:
+        workers = self._workers()
+        paused = {worker for worker, its in workers.items() if its.get("status") == "paused"}
+        if workers.keys() - self.hung - paused:
             self.last_worker = now
         elif now - self.last_worker > PATIENCE:
+            if paused:
+                raise RuntimeError(
+                    f"worker {min(paused)}: has stopped short of its memory limit; give it more: "
+                    "dask worker --memory-limit"
+                )
             raise RuntimeError(f"{_address(self.client)}: no worker is left; start some there")
         indices = {future.key: index for index, future in self.pending.items()}
         busy = {
@@ -164,16 +171,19 @@ class _Crew:
             worker: self.since.get(worker, now) for worker, theirs in busy.items() if theirs
         }
         for worker, since in self.since.items():
-            if now - since > self.time_limit:
-                self._give_up(worker, busy[worker])
+            # Dask lets none begin anything that is paused, and none goes on that has no memory.
+            limit = min(self.time_limit, PATIENCE) if worker in paused else self.time_limit
+            if now - since > limit:
+                self._give_up(worker, busy[worker], limit)
 
-    def _give_up(self, worker: str, indices: list[int]) -> None:
+    def _give_up(self, worker: str, indices: list[int], limit: float) -> None:
         self.hung.add(worker)
         for index in indices:
-            self._again(index, f"worker {worker}: no result within {self.time_limit:g} s")
+            self._again(index, f"worker {worker}: no result within {limit:g} s")
 
-    def _workers(self) -> set[str]:
-        return set(self.client.scheduler_info(n_workers=-1)["workers"])
+    def _workers(self) -> dict[str, dict]:
+        """What Dask tells of each worker, by address."""
+        return self.client.scheduler_info(n_workers=-1)["workers"]
 
     def dismiss(self) -> None:
         """Forget what hasn't ended."""

@@ -210,7 +210,7 @@ def test_in_the_shell(in_one_process, tmp_path, capsys, progressive):
     assert "find workers" in told
     if progressive:  # Another sequence of samples.
         assert told.startswith("16 samples per pixel, ") and f"{SPP} samples per pixel, " in told
-        assert mi.Bitmap(str(output)).size() == (80, 60)
+        assert list(mi.Bitmap(str(output)).size()) == [80, 60]
     else:
         assert np.array_equal(np.array(mi.Bitmap(str(output))), in_one_process[1])
 

@@ -386,9 +386,9 @@ def died() -> KilledWorker:
     return KilledWorker("call", SimpleNamespace(address="tcp://there:2"), 3)
 
 
-def looked_after(**client: object) -> Callable:
+def looked_after(workers: dict | None = None, **client: object) -> Callable:
     def action(_):
-        sent = crew(**client)
+        sent = crew(workers, **client)
         sent.last_look = sent.last_worker = -100.0
         sent.look_after_workers()
 
@@ -398,7 +398,7 @@ def looked_after(**client: object) -> Callable:
 def hung(_: Surroundings) -> None:
     sent = crew(workers={"tcp://there:2": {}})
     sent.tries[0] = tasks.MOST_TRIES
-    sent._give_up("tcp://there:2", [0])
+    sent._give_up("tcp://there:2", [0], 9.0)
 
 
 def nobody_comes(_: Surroundings) -> None:
@@ -406,6 +406,21 @@ def nobody_comes(_: Surroundings) -> None:
         raise TimeoutError
 
     check_workers(crew(wait_for_workers=wait).client, None)
+
+
+def scheduler_at(address: str, tls: tuple | None = None) -> Callable:
+    return lambda _: cluster_at(address, tls).__enter__()
+
+
+def scheduler_that_fails(reason: str) -> Callable:
+    def client(*_, **__):
+        raise OSError(reason)
+
+    def action(s):
+        s.patch.setattr("envmap_integrator.distributed.cluster.Client", client)
+        cluster_at("tcp://there:1").__enter__()
+
+    return action
 
 
 def another_version(_: Surroundings) -> None:
@@ -664,10 +679,39 @@ CASES = {
     "no worker any more": Case(
         looked_after(), "tcp://here:1", "no worker is left", "start some there"
     ),
+    "no worker that has memory": Case(
+        looked_after({"tcp://there:2": {"status": "paused"}}),
+        "worker tcp://there:2", "short of its memory limit", "dask worker --memory-limit",
+    ),
     "no worker": Case(nobody_comes, "tcp://here:1", "no worker has come within 60 s", "start some"),
     "no scheduler": Case(
-        lambda _: cluster_at("tcp://127.0.0.1:x").__enter__(),
-        "tcp://127.0.0.1:x", "no scheduler answers", "start one with: dask scheduler",
+        scheduler_that_fails("[Errno 111] refused"),
+        "tcp://there:1", "no scheduler answers", "start one with: dask scheduler",
+    ),
+    "a scheduler with TLS": Case(
+        scheduler_that_fails("ConnectionResetError: reset by peer"),
+        "tcp://there:1", "no scheduler answers", "use its address tls://there:1",
+    ),
+    "certificates of others": Case(
+        scheduler_that_fails("TLS certificate does not match"),
+        "tcp://there:1", "certificate does not match", "signed by the authority that both name",
+    ),
+    "no address": Case(scheduler_at("render-1"), "a scheduler", '"render-1"', "tcp://render-1:8786"),
+    "certificates without TLS": Case(
+        scheduler_at("tcp://there:1", ("ca", "cert", "key")), "certificates", "tcp://", "tls://"
+    ),
+    "TLS without certificates": Case(
+        scheduler_at("tls://there:1"), "tls://there:1", "certificates", "pass --tls CA CERT KEY"
+    ),
+    "missing certificates": Case(
+        scheduler_at("tls://there:1", ("none.pem", "none.pem", "none.pem")),
+        "no file", "none.pem", "takes CA, CERT and KEY",
+    ),
+    "damaged certificates": Case(
+        scheduler_at("tls://there:1", (__file__,) * 3), "TLS files", "test_messages.py", "your key"
+    ),
+    "certificates for nobody": Case(
+        shell(commands.render, tls=["ca", "cert", "key"]), "--tls", "--cluster", "leave it out"
     ),
     "path in parts": Case(
         in_parts("path"), "MonteCarloIntegrator", "in parts", "take envmap_hybrid"
