@@ -26,6 +26,8 @@ def connected(address: str, tls: tuple[str, str, str] | None = None) -> Iterator
     answers there.
     """
     security = _security(address, tls)
+    # What it finds, we say in one line.
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     try:
         client = Client(address, security=security, timeout=10, set_as_default=False)
     except OSError as error:

@@ -19,7 +19,7 @@ from ..system.jit import upload
 from ..system.progress import stage
 from . import worker
 from .job import Job, View
-from .tasks import PATIENCE, TIME_LIMIT, results
+from .tasks import PATIENCE, TIME_LIMIT, ask_workers, results, workers_of
 
 #: Samples of a part of a picture, at least and at most: half a second of a core, and 20 seconds.
 #: Each part costs 0.05 s more.
@@ -152,13 +152,13 @@ def send_state(client: Client, baked: BakedState) -> bytes:
         path = Path(folder) / "state.exr"
         baked.save(path)
         content = path.read_bytes()
-    client.run(worker.receive, content, on_error="ignore")
+    ask_workers(client, worker.receive, content)
     return content
 
 
 def count_workers(client: Client) -> int:
     """Number of the workers that there are now."""
-    return len(client.scheduler_info(n_workers=-1)["workers"])
+    return len(workers_of(client))
 
 
 def check_parts(integrator: mi.Integrator) -> None:
@@ -180,7 +180,7 @@ def check_workers(client: Client, job: Job) -> None:
             f"{client.scheduler.address}: no worker has come within {PATIENCE:g} s; start some "
             "with: dask worker ADDRESS"
         ) from None
-    for address, fault in client.run(worker.look, job, on_error="return").items():
+    for address, fault in ask_workers(client, worker.look, job).items():
         if "No module named 'envmap_integrator" in str(fault):
             fault = "has no package envmap_integrator; install it there"
         if fault and not isinstance(fault, OSError):  # Those have died; others are asked later.

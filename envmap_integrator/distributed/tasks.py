@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import queue
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from typing import Any
 
 from dask import config
@@ -17,6 +19,8 @@ from .worker import Outcome
 TIME_LIMIT = 300.0
 #: Seconds that a cluster may be without any worker.
 PATIENCE = 60.0
+#: Seconds in which a worker that does well answers a question, and a scheduler.
+ANSWER = 20.0
 #: How often a call may hang or get lost before it's given up.
 MOST_TRIES = 4
 #: Seconds between looks at what workers do.
@@ -74,7 +78,7 @@ class _Crew:
 
     def submit(self, index: int, *more: Any) -> None:
         """Send a call, with ``more`` arguments, to any worker that isn't hung."""
-        others = self._workers().keys() - self.hung if self.hung else None
+        others = workers_of(self.client).keys() - self.hung if self.hung else None
         future = self.client.submit(
             self.function,
             *self.calls[index],
@@ -151,7 +155,7 @@ class _Crew:
         self.last_look = now
         if self.client.status != "running":
             raise RuntimeError(f"{_address(self.client)}: the scheduler is gone; start it again")
-        workers = self._workers()
+        workers = workers_of(self.client)
         paused = {worker for worker, its in workers.items() if its.get("status") == "paused"}
         if workers.keys() - self.hung - paused:
             self.last_worker = now
@@ -165,7 +169,7 @@ class _Crew:
         indices = {future.key: index for index, future in self.pending.items()}
         busy = {
             worker: [indices[key] for key in keys if key in indices]
-            for worker, keys in self.client.processing().items()
+            for worker, keys in _ask_scheduler(self.client, "processing", workers=None).items()
         }
         self.since = {
             worker: self.since.get(worker, now) for worker, theirs in busy.items() if theirs
@@ -181,15 +185,56 @@ class _Crew:
         for index in indices:
             self._again(index, f"worker {worker}: no result within {limit:g} s")
 
-    def _workers(self) -> dict[str, dict]:
-        """What Dask tells of each worker, by address."""
-        return self.client.scheduler_info(n_workers=-1)["workers"]
-
     def dismiss(self) -> None:
         """Forget what hasn't ended."""
         left = [*self.pending.values(), *self._abandoned]
         if left and self.client.status == "running":
-            self.client.cancel(left, force=True)
+            with suppress(TimeoutError):
+                self.client.sync(self._cancel, left, callback_timeout=ANSWER)
+
+    async def _cancel(self, futures: list[Future]) -> None:
+        await self.client.cancel(futures, force=True)
+
+
+def workers_of(client: Client) -> dict[str, dict]:
+    """What Dask tells of each worker there is, by address.
+
+    Raises ``RuntimeError`` if the scheduler doesn't answer.
+    """
+    return _ask_scheduler(client, "identity", n_workers=-1).get("workers", {})
+
+
+def _ask_scheduler(client: Client, question: str, **about: Any) -> dict[str, Any]:
+    async def ask() -> dict[str, Any]:
+        return await getattr(client.scheduler, question)(**about)
+
+    try:
+        return client.sync(ask, callback_timeout=PATIENCE)
+    except TimeoutError:
+        raise RuntimeError(
+            f"{_address(client)}: the scheduler doesn't answer; start it again"
+        ) from None
+    except OSError:  # It has gone: the client will know in a moment.
+        return {}
+
+
+def ask_workers(client: Client, function: Callable, *arguments: Any) -> dict[str, Any]:
+    """Call a function on all workers there are: what each returns or raises, by address.
+
+    Those that don't answer within ``ANSWER`` seconds count as gone, by an ``OSError``.
+    """
+
+    async def ask(worker: str) -> Any:
+        asked = client.run(function, *arguments, workers=[worker], on_error="return")
+        try:
+            return (await asyncio.wait_for(asked, ANSWER)).get(worker)
+        except (asyncio.TimeoutError, OSError) as error:
+            return OSError(f"no answer ({error})")
+
+    async def ask_all(workers: Iterable[str]) -> dict[str, Any]:
+        return dict(zip(workers, await asyncio.gather(*map(ask, workers)), strict=True))
+
+    return client.sync(ask_all, workers_of(client).keys())
 
 
 def _address(client: Client) -> str:

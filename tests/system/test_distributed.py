@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import itertools
+import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -324,6 +327,90 @@ def test_workers_that_lack_something(options, message):
         with pytest.raises(ValueError, match="^worker tcp://") as caught:
             check_workers(one, Job.of(SCENE))
     assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+# ---------------------- Another program's cluster ----------------------
+
+
+@pytest.fixture(scope="module")
+def certificates(tmp_path_factory) -> dict[str, str]:
+    """Files by their names: an authority's certificate, one that it has signed, and a key for it;
+    the same of another authority.
+    """
+    if not shutil.which("openssl"):
+        pytest.skip("makes certificates with openssl")
+    folder = tmp_path_factory.mktemp("certificates")
+
+    def openssl(*arguments: str) -> None:
+        subprocess.run(["openssl", *arguments], cwd=folder, check=True, capture_output=True)
+
+    curve = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes")
+    for authority in ("ca", "other"):
+        openssl(
+            "req", "-x509", *curve, "-subj", f"/CN={authority}", "-keyout", "x", "-out", authority
+        )
+        openssl("req", *curve, "-subj", "/CN=us", "-keyout", f"{authority}-key", "-out", "request")
+        openssl(
+            *("x509", "-req", "-in", "request", "-CA", authority, "-CAkey", "x"),
+            *("-CAcreateserial", "-out", f"{authority}-signed"),
+        )
+    return {file.name: str(file) for file in folder.iterdir()}
+
+
+@pytest.fixture(scope="module")
+def farm(certificates, tmp_path_factory) -> Iterator[str]:
+    """Address of a scheduler with TLS, which was started in a shell, with a worker."""
+    folder = tmp_path_factory.mktemp("farm")
+    ca, certificate, key = (certificates[name] for name in ("ca", "ca-signed", "ca-key"))
+    tls = ["--tls-ca-file", ca, "--tls-cert", certificate, "--tls-key", key, "--no-dashboard"]
+    dask = [sys.executable, "-m", "dask"]
+    local = ["--protocol", "tls", "--host", "127.0.0.1", "--port", "0"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    file = folder / "scheduler.json"
+    started = []
+
+    def start(*arguments: str) -> None:
+        started.append(
+            subprocess.Popen(
+                [*dask, *arguments, *tls], cwd=folder, env=environment,
+                stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            )
+        )  # fmt: skip
+
+    try:
+        start("scheduler", *local, "--scheduler-file", str(file))
+        start("worker", "--scheduler-file", str(file), "--nthreads", "1", "--no-nanny")
+        while not file.exists():
+            assert started[0].poll() is None
+            time.sleep(0.1)
+        time.sleep(0.1)
+        yield json.loads(file.read_text())["address"]
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
+
+
+def test_certificates(farm, certificates, at_once):
+    """A worker of a scheduler that knows us by our certificate; both are elsewhere."""
+    ours = [certificates[name] for name in ("ca", "ca-signed", "ca-key")]
+    with cluster.connected(farm, ours) as client:
+        assert farm.startswith("tls://")
+        assert np.array_equal(by_workers(client), at_once)
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (("ca", "other-signed", "other-key"), "must be signed by the authority that both name"),
+        (("other", "ca-signed", "ca-key"), "must be signed by the authority that both name"),
+        (("ca", "ca-signed", "other-key"), "give the authority's certificate, yours, and your key"),
+    ],
+)
+def test_wrong_certificates(farm, certificates, names, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        cluster.connected(farm, [certificates[name] for name in names]).__enter__()
+    assert "\n" not in str(caught.value)
 
 
 # ---------------------- Calls ----------------------

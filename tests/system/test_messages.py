@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import asyncio
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ from envmap_integrator.distributed import tasks
 from envmap_integrator.distributed.cluster import connected as cluster_at
 from envmap_integrator.distributed.job import View
 from envmap_integrator.distributed.render import check_workers, render_job
+from envmap_integrator.distributed.tasks import workers_of
 from envmap_integrator.distributed.worker import Outcome
 from envmap_integrator.imaging import film
 from envmap_integrator.imaging.aovs import parse_aovs
@@ -364,8 +366,15 @@ class Ended:
 
 def crew(workers: dict | None = None, **client: object) -> tasks._Crew:
     """One that has sent a single call to a cluster that isn't there."""
-    here = {"status": "running", "scheduler": SimpleNamespace(address="tcp://here:1")}
-    here["scheduler_info"] = lambda n_workers: {"workers": workers or {}}
+
+    async def identity(n_workers: int):
+        return {"workers": workers or {}}
+
+    def sync(function: Callable, *arguments: object, callback_timeout: float | None = None):
+        return asyncio.run(function(*arguments))
+
+    scheduler = SimpleNamespace(address="tcp://here:1", identity=identity)
+    here = {"status": "running", "scheduler": scheduler, "sync": sync}
     sent = tasks._Crew(SimpleNamespace(**here | client), None, [()], 9.0, None)
     sent.pending[0] = Ended()
     return sent
@@ -424,10 +433,19 @@ def scheduler_that_fails(reason: str) -> Callable:
 
 
 def another_version(_: Surroundings) -> None:
-    def run(*_, on_error: str):
-        return {"tcp://there:2": "has mitsuba 3.8.0 instead of 3.9.1; install that version there"}
+    async def run(*_, workers: list[str], on_error: str):
+        fault = "has mitsuba 3.8.0 instead of 3.9.1; install that version there"
+        return dict.fromkeys(workers, fault)
 
-    check_workers(crew(wait_for_workers=lambda *_, timeout: None, run=run).client, None)
+    there = {"tcp://there:2": {}}
+    check_workers(crew(there, wait_for_workers=lambda *_, timeout: None, run=run).client, None)
+
+
+def silent_scheduler(_: Surroundings) -> None:
+    def sync(function: Callable, callback_timeout: float):
+        raise TimeoutError
+
+    workers_of(crew(sync=sync).client)
 
 
 def in_parts(kind: str, **settings: object) -> Callable:
@@ -675,6 +693,9 @@ CASES = {
     "a hung worker": Case(hung, "worker tcp://there:2", "no result within 9 s", "see the logs"),
     "no scheduler any more": Case(
         looked_after(status="closed"), "tcp://here:1", "scheduler is gone", "start it again"
+    ),
+    "a scheduler that hangs": Case(
+        silent_scheduler, "tcp://here:1", "doesn't answer", "start it again"
     ),
     "no worker any more": Case(
         looked_after(), "tcp://here:1", "no worker is left", "start some there"
