@@ -48,6 +48,8 @@ def render(args: argparse.Namespace) -> int:
         compilation = compilation_time()
     _write(args, output, bitmap, settings, seconds, compilation, more)
     _report(args, seconds, compilation, output, **more, settings=settings)
+    if not (args.quiet or args.json):
+        print(f"by {settings['integrator']}, {settings['spp']} samples per pixel")
     return 0
 
 
