@@ -49,7 +49,7 @@ def render(args: argparse.Namespace) -> int:
     _write(args, output, bitmap, settings, seconds, compilation, more)
     _report(args, seconds, compilation, output, **more, settings=settings)
     if not (args.quiet or args.json):
-        print(f"by {settings['integrator']}, {settings['spp']} samples per pixel")
+        print(f"by {settings['integrator']} with {settings['spp']} samples a pixel")
     return 0
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -175,7 +176,7 @@ def check_workers(client: Client, job: Job) -> None:
     """Raise ``ValueError`` for the first worker that can't render, with what to do about it."""
     try:
         client.wait_for_workers(1, timeout=PATIENCE)
-    except TimeoutError:
+    except asyncio.TimeoutError:
         raise ValueError(
             f"{client.scheduler.address}: no worker has come within {PATIENCE:g} s; start some "
             "with: dask worker ADDRESS"

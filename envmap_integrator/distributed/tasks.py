@@ -189,7 +189,7 @@ class _Crew:
         """Forget what hasn't ended."""
         left = [*self.pending.values(), *self._abandoned]
         if left and self.client.status == "running":
-            with suppress(TimeoutError):
+            with suppress(asyncio.TimeoutError):
                 self.client.sync(self._cancel, left, callback_timeout=ANSWER)
 
     async def _cancel(self, futures: list[Future]) -> None:
@@ -210,7 +210,7 @@ def _ask_scheduler(client: Client, question: str, **about: Any) -> dict[str, Any
 
     try:
         return client.sync(ask, callback_timeout=PATIENCE)
-    except TimeoutError:
+    except asyncio.TimeoutError:
         raise RuntimeError(
             f"{_address(client)}: the scheduler doesn't answer; start it again"
         ) from None

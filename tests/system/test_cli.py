@@ -288,7 +288,7 @@ def test_stage_times_of_the_pre_pass_are_reported(scene, preparing_integrator, c
     times = json.loads(header(scene.with_suffix(".exr"))["stage_times"])
     assert times["radiosity"] == 1.25
     told = capsys.readouterr().out
-    assert "radiosity" in told and f"by {preparing_integrator}, " in told
+    assert "radiosity" in told and f"by {preparing_integrator} with " in told
 
 
 def test_bake_saves_the_state(scene, preparing_integrator, tmp_path, capsys):
