@@ -11,6 +11,7 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from textwrap import fill
 from typing import NoReturn
 
 from envmap_integrator.cli import commands
@@ -107,6 +108,8 @@ class _Parser(argparse.ArgumentParser):
     """Says what is wrong in one line, without the usage text, and shows examples as they are."""
 
     def __init__(self, **settings):
+        if "description" in settings:
+            settings["description"] = fill(" ".join(settings["description"].split()), 88)
         super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, **settings)
 
     def error(self, message: str) -> NoReturn:

@@ -33,6 +33,7 @@ def render(args: argparse.Namespace) -> int:
     output = args.output or args.scene.with_suffix(".exr")
     check_output(output, hint=" (--png adds a PNG)")
     _require(args.spp >= 0, f"--spp must not be negative, got {args.spp}")
+    _require(not args.tls or args.cluster is not None, "--tls is for --cluster: leave it out")
     _configure_machine(args)
     seconds: dict[str, float] = {}
     with record_kernels():
@@ -41,13 +42,14 @@ def render(args: argparse.Namespace) -> int:
         sensor = _sensor(scene, args.sensor)
         settings = _settings(args, scene_file, scene, sensor)
         more: dict[str, float] = {}
-        if _improves(args):
-            bitmap = _improve(args, scene, sensor, settings, seconds, more, output)
-        else:
-            bitmap = _render_at_once(args, scene, sensor, settings, seconds, more)
+        with ExitStack() as stack:
+            asked = args, scene, sensor, settings, seconds, more, stack
+            bitmap = _improve(*asked, output) if _improves(args) else _render_at_once(*asked)
         compilation = compilation_time()
     _write(args, output, bitmap, settings, seconds, compilation, more)
     _report(args, seconds, compilation, output, **more, settings=settings)
+    if not (args.quiet or args.json):
+        print(f"by {settings['integrator']} with {settings['spp']} samples a pixel")
     return 0
 
 
@@ -62,23 +64,22 @@ def _by_workers(args: argparse.Namespace) -> bool:
     return args.workers is not None or args.cluster is not None
 
 
-def _render_at_once(args, scene, sensor, settings, seconds, more) -> mi.Bitmap:
+def _render_at_once(args, scene, sensor, settings, seconds, more, stack) -> mi.Bitmap:
     integrator = scene.integrator()
     for_denoiser = args.denoise and prepare_for_denoiser(integrator)
     if args.denoise:  # Fails before the work starts, if there is no denoiser.
         warm_up(*sensor.film().crop_size())
-    with ExitStack() as stack:
-        render = integrator.render
-        if _by_workers(args):
-            with measure(seconds, "find workers"):
-                render = workers.renderer(args, stack)
-        if hasattr(integrator, "prepare"):
-            state = integrator.prepare(scene, sensor, args.spp)
-            seconds |= state.stage_times
-            more["cache_error"] = state.relative_error
-        with measure(seconds, "render"):
-            # Not mi.render, which would make another exception of Ctrl-C.
-            dr.eval(render(scene, sensor, seed=args.seed, spp=args.spp))
+    render = integrator.render
+    if _by_workers(args):
+        with measure(seconds, "find workers"):
+            render = workers.renderer(args, stack)
+    if hasattr(integrator, "prepare"):
+        state = integrator.prepare(scene, sensor, args.spp)
+        seconds |= state.stage_times
+        more["cache_error"] = state.relative_error
+    with measure(seconds, "render"):
+        # Not mi.render, which would make another exception of Ctrl-C.
+        dr.eval(render(scene, sensor, seed=args.seed, spp=args.spp))
     bitmap = sensor.film().bitmap()
     if args.denoise:
         with measure(seconds, "denoise"):
@@ -92,7 +93,7 @@ def _render_at_once(args, scene, sensor, settings, seconds, more) -> mi.Bitmap:
 PASS, MOST = 16, 4096
 
 
-def _improve(args, scene, sensor, settings, seconds, more, output) -> mi.Bitmap:
+def _improve(args, scene, sensor, settings, seconds, more, stack, output) -> mi.Bitmap:
     """Write pictures that get better, until the samples, the time or the error asked for."""
     integrator = scene.integrator()
     _require(
@@ -106,11 +107,10 @@ def _improve(args, scene, sensor, settings, seconds, more, output) -> mi.Bitmap:
     )
     for flag, value in (("--time", args.time), ("--target-error", args.target_error)):
         _require(value is None or value > 0, f"{flag} must be above 0, got {value}")
-    _require(
-        not _by_workers(args),
-        "--workers and --cluster render one picture: leave out --progressive, --time and "
-        "--target-error",
-    )
+    elsewhere = None
+    if _by_workers(args):
+        with measure(seconds, "find workers"):
+            elsewhere = workers.pass_renderer(args, stack, scene)
     asked = args.time is not None or args.target_error is not None
     total = args.spp or (MOST if asked else settings["spp"])
     begin = time.perf_counter()
@@ -125,6 +125,7 @@ def _improve(args, scene, sensor, settings, seconds, more, output) -> mi.Bitmap:
         target_error=args.target_error or 0.0,
         progress_file=output.with_suffix(".progress.exr") if keeps else None,
         resume=args.resume,
+        elsewhere=elsewhere,
     )
     for better in pictures:
         elapsed = time.perf_counter() - begin

@@ -11,6 +11,10 @@ _PYTHON_TRACEBACK = re.compile(r"^.*?Traceback \(most recent call last\):.*\n\w*
 
 _FIXES = (
     (re.compile(r"Plugin \"[^\"]*\" not found"), "check its spelling, or pass --integrator NAME"),
+    (
+        re.compile(r'unreferenced propert.* in integrator plugin of type "(path|volpath|direct)"'),
+        r"\1 has no such parameter: pass --integrator envmap_hybrid, or remove it",
+    ),
     (re.compile(r"unreferenced propert"), "check the spelling, or remove it"),
     (re.compile(r"undefined parameter: \$(\w+)"), r"pass -D \1=VALUE"),
     (re.compile(r"unused parameters?: - \$(\w+)"), r"the scene has no $\1; remove -D \1"),

@@ -6,9 +6,15 @@ import argparse
 import importlib.util
 from collections.abc import Callable
 from contextlib import ExitStack
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+    from envmap_integrator.distributed.job import Job
 
 
 def renderer(args: argparse.Namespace, stack: ExitStack) -> Callable[..., mi.TensorXf]:
@@ -16,12 +22,33 @@ def renderer(args: argparse.Namespace, stack: ExitStack) -> Callable[..., mi.Ten
 
     Raises ``ValueError`` if there are none, or if one of them can't give the same picture.
     """
+    client, job = _found(args, stack)
+    from envmap_integrator.distributed.job import View
+    from envmap_integrator.distributed.render import check_workers, render_job
+
+    check_workers(client, job)
+
+    def render(scene, sensor, seed, spp):
+        ((_, picture),) = render_job(client, job, scene, [View(args.sensor)], spp, seed)
+        return picture
+
+    return render
+
+
+def pass_renderer(args: argparse.Namespace, stack: ExitStack, scene: mi.Scene) -> Callable:
+    """``elsewhere`` of ``integrator.progressive``: as ``renderer``."""
+    client, job = _found(args, stack)
+    from envmap_integrator.distributed.progressive import by_workers
+
+    return by_workers(client, job, scene, args.sensor)
+
+
+def _found(args: argparse.Namespace, stack: ExitStack) -> tuple[Client, Job]:
     if not importlib.util.find_spec("distributed"):
         raise ImportError("Dask is missing: pip install distributed")
     # It takes a while, and few need it.
     from envmap_integrator.distributed import cluster
-    from envmap_integrator.distributed.job import Job, View
-    from envmap_integrator.distributed.render import check_workers, render_job
+    from envmap_integrator.distributed.job import Job
 
     if args.cluster is not None:
         client = stack.enter_context(cluster.connected(args.cluster, args.tls))
@@ -36,10 +63,4 @@ def renderer(args: argparse.Namespace, stack: ExitStack) -> Callable[..., mi.Ten
         settings=dict(args.set),
         denoise=args.denoise,
     )
-    check_workers(client, job)
-
-    def render(scene, sensor, seed, spp):
-        ((_, picture),) = render_job(client, job, scene, [View(args.sensor)], spp, seed)
-        return picture
-
-    return render
+    return client, job

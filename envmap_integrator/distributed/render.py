@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -12,14 +13,14 @@ import mitsuba as mi
 import numpy as np
 from distributed import Client
 
-from ..imaging.film import n_pixels_of, pixel_ranges
+from ..imaging.film import Sums, n_pixels_of, pixel_ranges
 from ..preparation.baked_state import BakedState
 from ..system.interrupt import interruptible
 from ..system.jit import upload
 from ..system.progress import stage
 from . import worker
 from .job import Job, View
-from .tasks import PATIENCE, TIME_LIMIT, results
+from .tasks import PATIENCE, TIME_LIMIT, ask_workers, results, workers_of
 
 #: Samples of a part of a picture, at least and at most: half a second of a core, and 20 seconds.
 #: Each part costs 0.05 s more.
@@ -102,16 +103,10 @@ def render_job(
 
     The film of its sensor holds a picture when it comes. See ``render_distributed``.
     """
-    integrator = scene.integrator()
-    if not hasattr(integrator, "pixel_sums"):
-        raise ValueError(
-            f"{type(integrator).__name__}: can't be rendered in parts; take envmap_hybrid, or one "
-            "machine"
-        )
-    integrator.require_coherent("renders all pixels at once")
+    check_parts(scene.integrator())
     check_workers(client, job)
     frames = _prepared(client, scene, views, spp)
-    n_workers = len(client.scheduler_info()["workers"])
+    n_workers = count_workers(client)
     parts = []
     for index, frame in enumerate(frames):
         left = (len(frames) - index) * frame.n_pixels
@@ -121,7 +116,8 @@ def render_job(
     for index, pixels in parts:
         frame = frames[index]
         digest = worker.state_digest(frame.state)
-        calls.append((digest, job, frame.view, seed, frame.spp, pixels.start, pixels.stop))
+        samples = worker.Samples(seed, frame.spp)
+        calls.append((digest, job, frame.view, samples, pixels.start, pixels.stop))
 
     def state_of(call: int) -> bytes:
         return frames[parts[call][0]].state
@@ -130,9 +126,9 @@ def render_job(
     with stage("Rendering by workers", total=n_all) as advance:
         for call, sums in results(client, worker.render, calls, time_limit, state_of):
             index, pixels = parts[call]
-            frames[index].take(pixels, sums)
+            frames[index].sums.take(pixels, sums)
             advance(len(pixels))
-            if frames[index].left == 0:
+            if frames[index].sums.left == 0:
                 yield index, frames[index].picture(scene)
 
 
@@ -146,37 +142,59 @@ def _prepared(client: Client, scene: mi.Scene, views: Sequence[View], spp: int) 
             baked = scene.integrator().prepare(scene, sensor, samples)
             n_pixels = n_pixels_of(sensor.film())
         if id(baked) not in known:
-            known[id(baked)] = baked, _file_of(baked)
-            client.run(worker.receive, known[id(baked)][1], on_error="ignore")
+            known[id(baked)] = baked, send_state(client, baked)
         frames.append(_Frame(view, samples, n_pixels, known[id(baked)][1]))
     return frames
+
+
+def send_state(client: Client, baked: BakedState) -> bytes:
+    """Send a baked state to all workers there are; returns its file."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "state.exr"
+        baked.save(path)
+        content = path.read_bytes()
+    ask_workers(client, worker.receive, content)
+    return content
+
+
+def count_workers(client: Client) -> int:
+    """Number of the workers that there are now."""
+    return len(workers_of(client))
+
+
+def check_parts(integrator: mi.Integrator) -> None:
+    """Raise ``ValueError`` for an integrator that can't render some pixels alone."""
+    if not hasattr(integrator, "pixel_sums"):
+        raise ValueError(
+            f"{type(integrator).__name__}: can't be rendered in parts; take envmap_hybrid, or one "
+            "machine"
+        )
+    integrator.require_coherent("renders all pixels at once")
 
 
 def check_workers(client: Client, job: Job) -> None:
     """Raise ``ValueError`` for the first worker that can't render, with what to do about it."""
     try:
         client.wait_for_workers(1, timeout=PATIENCE)
-    except TimeoutError:
+    except asyncio.TimeoutError:
         raise ValueError(
             f"{client.scheduler.address}: no worker has come within {PATIENCE:g} s; start some "
             "with: dask worker ADDRESS"
         ) from None
-    for address, fault in client.run(worker.look, job, on_error="return").items():
+    for address, fault in ask_workers(client, worker.look, job).items():
         if "No module named 'envmap_integrator" in str(fault):
             fault = "has no package envmap_integrator; install it there"
         if fault and not isinstance(fault, OSError):  # Those have died; others are asked later.
             raise ValueError(f"worker {address}: {' '.join(str(fault).split())}")
 
 
-class _Frame:
-    """The sums over the samples of a view's pixels, as they come.
+class PixelSums:
+    """The sums over the samples of all pixels, as they come.
 
-    state   file of the baked state
     left    number of pixels that haven't come yet
     """
 
-    def __init__(self, view: View, spp: int, n_pixels: int, state: bytes):
-        self.view, self.spp, self.state = view, spp, state
+    def __init__(self, n_pixels: int):
         self.n_pixels = self.left = n_pixels
         self._sums: np.ndarray | None = None
 
@@ -187,22 +205,26 @@ class _Frame:
         self._sums[:, pixels.start : pixels.stop] = sums
         self.left -= len(pixels)
 
+    def channels(self) -> Sums:
+        """The sums of all pixels; they are used up."""
+        channels, self._sums = self._sums, None
+        return [upload(mi.Float, channel) for channel in channels]
+
+
+class _Frame:
+    """A view's picture; ``state`` is the file of the baked state."""
+
+    def __init__(self, view: View, spp: int, n_pixels: int, state: bytes):
+        self.view, self.spp, self.n_pixels, self.state = view, spp, n_pixels, state
+        self.sums = PixelSums(n_pixels)
+
     def picture(self, scene: mi.Scene) -> mi.TensorXf:
         """The picture, also in the sensor's film; the sums are used up."""
-        channels, self._sums = self._sums, None
         with self.view.of(scene) as sensor, interruptible(), dr.suspend_grad():
-            scene.integrator().put(sensor, [upload(mi.Float, c) for c in channels], self.spp)
+            scene.integrator().put(sensor, self.sums.channels(), self.spp)
             picture = sensor.film().develop()
             dr.eval(picture)
         return picture
-
-
-def _file_of(baked: BakedState) -> bytes:
-    """The content of the file that a baked state is saved to."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "state.exr"
-        baked.save(path)
-        return path.read_bytes()
 
 
 def part_sizes(n_pixels: int, left: int, spp: int, n_workers: int) -> Iterator[int]:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import queue
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from typing import Any
 
 from dask import config
@@ -16,6 +19,8 @@ from .worker import Outcome
 TIME_LIMIT = 300.0
 #: Seconds that a cluster may be without any worker.
 PATIENCE = 60.0
+#: Seconds in which a worker that does well answers a question, and a scheduler.
+ANSWER = 20.0
 #: How often a call may hang or get lost before it's given up.
 MOST_TRIES = 4
 #: Seconds between looks at what workers do.
@@ -31,8 +36,8 @@ def results(
 ) -> Iterator[tuple[int, Any]]:
     """The values of ``function(*call)`` for all calls, each once, with their indices, as they end.
 
-    Where a worker answers that it lacks something, the call is sent again with ``lacking(index)``
-    as its last argument.
+    Calls that are appended while it's used are done as well. Where a worker answers that it lacks
+    something, the call is sent again with ``lacking(index)`` as its last argument.
 
     What a worker had that died, hung or ran out of memory is done again by another one. Raises
     ``RuntimeError``, in one line, if workers report a fault, or die or hang at the same call again
@@ -40,9 +45,11 @@ def results(
     """
     crew = _Crew(client, function, calls, time_limit, lacking)
     try:
-        for index in range(len(calls)):
-            crew.submit(index)
-        while crew.pending:
+        sent = 0
+        while crew.pending or sent < len(calls):
+            for index in range(sent, len(calls)):
+                crew.submit(index)
+            sent = len(calls)
             yield from crew.arrived()
             crew.look_after_workers()
     finally:
@@ -62,7 +69,7 @@ class _Crew:
         self.client, self.function, self.calls = client, function, calls
         self.time_limit, self.lacking = time_limit, lacking
         self.pending: dict[int, Future] = {}
-        self.tries = [0] * len(calls)
+        self.tries: Counter[int] = Counter()
         self.since: dict[str, float] = {}
         self.hung: set[str] = set()
         self.last_look = self.last_worker = time.monotonic()
@@ -71,7 +78,7 @@ class _Crew:
 
     def submit(self, index: int, *more: Any) -> None:
         """Send a call, with ``more`` arguments, to any worker that isn't hung."""
-        others = self._workers() - self.hung if self.hung else None
+        others = workers_of(self.client).keys() - self.hung if self.hung else None
         future = self.client.submit(
             self.function,
             *self.calls[index],
@@ -148,35 +155,86 @@ class _Crew:
         self.last_look = now
         if self.client.status != "running":
             raise RuntimeError(f"{_address(self.client)}: the scheduler is gone; start it again")
-        if self._workers() - self.hung:
+        workers = workers_of(self.client)
+        paused = {worker for worker, its in workers.items() if its.get("status") == "paused"}
+        if workers.keys() - self.hung - paused:
             self.last_worker = now
         elif now - self.last_worker > PATIENCE:
+            if paused:
+                raise RuntimeError(
+                    f"worker {min(paused)}: has stopped short of its memory limit; give it more: "
+                    "dask worker --memory-limit"
+                )
             raise RuntimeError(f"{_address(self.client)}: no worker is left; start some there")
         indices = {future.key: index for index, future in self.pending.items()}
         busy = {
             worker: [indices[key] for key in keys if key in indices]
-            for worker, keys in self.client.processing().items()
+            for worker, keys in _ask_scheduler(self.client, "processing", workers=None).items()
         }
         self.since = {
             worker: self.since.get(worker, now) for worker, theirs in busy.items() if theirs
         }
         for worker, since in self.since.items():
-            if now - since > self.time_limit:
-                self._give_up(worker, busy[worker])
+            # Dask lets none begin anything that is paused, and none goes on that has no memory.
+            limit = min(self.time_limit, PATIENCE) if worker in paused else self.time_limit
+            if now - since > limit:
+                self._give_up(worker, busy[worker], limit)
 
-    def _give_up(self, worker: str, indices: list[int]) -> None:
+    def _give_up(self, worker: str, indices: list[int], limit: float) -> None:
         self.hung.add(worker)
         for index in indices:
-            self._again(index, f"worker {worker}: no result within {self.time_limit:g} s")
-
-    def _workers(self) -> set[str]:
-        return set(self.client.scheduler_info()["workers"])
+            self._again(index, f"worker {worker}: no result within {limit:g} s")
 
     def dismiss(self) -> None:
         """Forget what hasn't ended."""
         left = [*self.pending.values(), *self._abandoned]
         if left and self.client.status == "running":
-            self.client.cancel(left, force=True)
+            with suppress(asyncio.TimeoutError):
+                self.client.sync(self._cancel, left, callback_timeout=ANSWER)
+
+    async def _cancel(self, futures: list[Future]) -> None:
+        await self.client.cancel(futures, force=True)
+
+
+def workers_of(client: Client) -> dict[str, dict]:
+    """What Dask tells of each worker there is, by address.
+
+    Raises ``RuntimeError`` if the scheduler doesn't answer.
+    """
+    return _ask_scheduler(client, "identity", n_workers=-1).get("workers", {})
+
+
+def _ask_scheduler(client: Client, question: str, **about: Any) -> dict[str, Any]:
+    async def ask() -> dict[str, Any]:
+        return await getattr(client.scheduler, question)(**about)
+
+    try:
+        return client.sync(ask, callback_timeout=PATIENCE)
+    except asyncio.TimeoutError:
+        raise RuntimeError(
+            f"{_address(client)}: the scheduler doesn't answer; start it again"
+        ) from None
+    except OSError:  # It has gone: the client will know in a moment.
+        return {}
+
+
+def ask_workers(client: Client, function: Callable, *arguments: Any) -> dict[str, Any]:
+    """Call a function on all workers there are: what each returns or raises, by address.
+
+    Those that don't answer within ``ANSWER`` seconds count as gone, by an ``OSError``.
+    """
+
+    async def ask(worker: str) -> Any:
+        asked = client.run(function, *arguments, workers=[worker], on_error="return")
+        try:
+            return (await asyncio.wait_for(asked, ANSWER)).get(worker)
+        except (asyncio.TimeoutError, OSError) as error:
+            return OSError(f"no answer ({error})")
+
+    async def ask_all(workers: Iterable[str]) -> dict[str, Any]:
+        return dict(zip(workers, await asyncio.gather(*map(ask, workers)), strict=True))
+
+    return client.sync(ask_all, workers_of(client).keys())
 
 
 def _address(client: Client) -> str:

@@ -56,17 +56,25 @@ def receive(state: bytes, dask_worker: Worker) -> None:
             file.write(state)
 
 
+class Samples(NamedTuple):
+    """Samples of each pixel: see ``pixel_sums`` of the integrators."""
+
+    seed: int
+    spp: int
+    first: int = 0
+    planned: int = 0
+
+
 def render(
     digest: str,
     job: Job,
     view: View,
-    seed: int,
-    spp: int,
+    samples: Samples,
     begin: int,
     end: int,
     state: bytes | None = None,
 ) -> Outcome:
-    """Sums over the samples of the pixels ``begin … end`` of a view, [channels, pixels] float32.
+    """Sums over samples of the pixels ``begin … end`` of a view, [channels, pixels] float32.
 
     ``digest`` is the ``state_digest`` of the baked state; ``state`` is its file, for a worker that
     lacks it: it may have come later than the others.
@@ -77,7 +85,7 @@ def render(
     path = _path(worker, digest)
     if not path.exists():
         return Outcome(worker.address, None, lacks=True)
-    arguments = (worker.address, path, job, view, seed, spp, range(begin, end))
+    arguments = (worker.address, path, job, view, samples, range(begin, end))
     return _thread.submit(_render, *arguments).result()
 
 
@@ -88,7 +96,7 @@ def _fault(job: Job) -> str:
         return _one_line(error)
 
 
-def _render(address, state, job, view, seed, spp, pixels) -> Outcome:
+def _render(address, state, job, view, samples, pixels) -> Outcome:
     try:
         fault = _fault(job)
         if fault:
@@ -97,7 +105,8 @@ def _render(address, state, job, view, seed, spp, pixels) -> Outcome:
         integrator = scene.integrator()
         integrator.cache_file = str(state)
         with view.of(scene) as sensor:
-            sums = integrator.pixel_sums(scene, sensor, seed, spp, pixels)
+            seed, spp, first, planned = samples
+            sums = integrator.pixel_sums(scene, sensor, seed, spp, pixels, first, planned)
         return Outcome(address, np.stack([value.numpy() for value in sums]))
     except MemoryError:  # Another worker may have more.
         raise

@@ -25,6 +25,7 @@ TYPES = {
     "irradiance_error": "Y",
     "cluster": "RGB",
     "served": "RGB",
+    "near": "Y",
 }
 #: Brightness of the colours of patches that stand for indirect light alone.
 UNEVEN = 0.4
@@ -86,12 +87,16 @@ def _values(
 ) -> list[mi.Float]:
     """Values of the channels of AOVs at a camera hit, 0 where there is none.
 
-    All of them but ``served`` are exact: what is stored for the very place.
+    All of them are exact, what is stored for the very place, but ``served`` and ``near``, which
+    tell of one secondary ray.
     """
     patch = lookup.patches.find(
         vertex.si.p, vertex.normal, vertex.object_id, vertex.cell, vertex.hit
     )
     cache = lookup.cache
+    ends = ()
+    if any(aov.type in ("served", "near") for aov in aovs):
+        ends = served(scene, lookup, rules, sampler, vertex)
 
     def value(kind: str) -> tuple[mi.Float, ...]:
         match kind:
@@ -110,7 +115,9 @@ def _values(
                 colour = false_colour(vertex.cube.cluster)
                 return tuple(dr.select(vertex.cube.valid, c, 0) for c in colour)
             case "served":
-                return served(scene, lookup, rules, sampler, vertex)
+                return ends[:3]
+            case "near":
+                return ends[3:]
 
     return [channel for aov in aovs for channel in value(aov.type)]
 

@@ -29,7 +29,7 @@ def denoise(
     picture: np.ndarray,
     spp: int,
     seed: int,
-    sensor: int = 0,
+    sensor: mi.Sensor | int = 0,
 ) -> np.ndarray:
     """The denoised picture of a sensor, [H, W, 3]; the guides are rendered here.
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from operator import add
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -46,11 +46,32 @@ class Improving:
     state: Any
 
 
+class Pass(NamedTuple):
+    """Samples of all pixels.
+
+    stream   index of the stream that they belong to, of two
+    seed     of that stream
+    first    index in it of the first sample of each pixel
+    n        samples per pixel
+    """
+
+    stream: int
+    seed: int
+    first: int
+    n: int
+
+
+#: Renders passes: sums over the samples of each, in order. It may begin with the next ones while
+#: those of one are used.
+Renderer = Callable[[Iterator[Pass]], Generator[Sums]]
+
+
 def improve(
-    send: Callable[[int, int, int], Sums],
+    render: Renderer,
     develop: Callable[[Sums, int], mi.TensorXf],
     keep: Callable[[], None],
     progress: Progress,
+    seed: int,
     spp: int,
     total: int,
     deadline: float,
@@ -59,11 +80,11 @@ def improve(
 ) -> Iterator[Improving]:
     """Render passes of ``spp`` samples per pixel, and give a picture when it's worth it.
 
-    ``send(stream, first, n)`` renders ``n`` samples, from the ``first`` on, of one of two streams,
-    which are independent of each other: how much their pictures differ tells the noise of both
-    together. Within each, passes are well stratified together. ``develop(sums, n_samples)`` makes a
-    picture and uses the list up. ``progress`` is what there is so far, and is brought up to date;
-    ``keep()`` is called for every picture, and on Ctrl-C.
+    They belong to two streams by turns, which are independent of each other: how much their
+    pictures differ tells the noise of both together. Within each, passes are well stratified
+    together. ``develop(sums, n_samples)`` makes a picture and uses the list up. ``progress`` is
+    what there is so far, and is brought up to date; ``keep()`` is called for every picture, and on
+    Ctrl-C.
 
     It ends after ``total`` samples per pixel, if another pass would take longer than to the
     ``deadline`` of ``time.perf_counter``, or with an error of at most ``target``.
@@ -71,6 +92,8 @@ def improve(
     begin, n_before = time.perf_counter(), progress.samples
     pace, enough = 0.0, math.inf
     due, last = n_before > 0, n_before >= total  # What there is already is shown at once.
+    plan = passes(progress, seed, spp, total)
+    rendered = render(passes(progress, seed, spp, total))
     try:
         while True:
             if due:
@@ -83,7 +106,7 @@ def improve(
                     enough = progress.samples * error / target
             if last:
                 return
-            _pass(send, progress, spp, total)
+            _take(next(plan), rendered, progress)
             now = time.perf_counter()
             pace = (now - begin) / (progress.samples - n_before)
             last = progress.samples >= total or now + pace * spp > deadline
@@ -92,21 +115,33 @@ def improve(
         if progress.samples:
             keep()
         raise
+    finally:
+        rendered.close()
 
 
-def _pass(send, progress: Progress, spp: int, total: int) -> None:
-    """The next pass of the stream that has fewer samples; one that was cut short is filled up."""
-    one, other = progress.streams
-    index = int(other.samples < one.samples)
-    so_far = progress.streams[index]
-    n = min(spp - so_far.samples % spp, total - progress.samples)
+def passes(progress: Progress, seed: int, spp: int, total: int) -> Iterator[Pass]:
+    """All passes from what there is to ``total`` samples per pixel.
+
+    Each is of the stream that has fewer samples then; one that was cut short is filled up.
+    """
+    samples = [stream.samples for stream in progress.streams]
+    while (left := total - sum(samples)) > 0:
+        index = int(samples[1] < samples[0])
+        n = min(spp - samples[index] % spp, left)
+        yield Pass(index, 2 * seed + index & 0xFFFFFFFF, samples[index], n)
+        samples[index] += n
+
+
+def _take(due: Pass, rendered: Iterator[Sums], progress: Progress) -> None:
+    """Add the next pass to the stream that it belongs to."""
+    so_far = progress.streams[due.stream]
     with interruptible(), dr.suspend_grad():
-        sums = send(index, so_far.samples, n)
+        sums = next(rendered)
         if so_far.samples:
             sums = [*map(add, so_far.sums, sums)]
         dr.eval(sums)
     # At once: Ctrl-C may come between any two steps.
-    progress.streams[index] = Stream(sums, so_far.samples + n)
+    progress.streams[due.stream] = Stream(sums, so_far.samples + due.n)
 
 
 def _picture(streams: list[Stream], develop) -> tuple[mi.TensorXf, float]:

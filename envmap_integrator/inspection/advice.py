@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -71,12 +72,17 @@ def about_cluster(view: ClusterView) -> list[str]:
     found = []
     if view.seen == 0:
         found.append("This sensor doesn't see it: no_cluster leaves its shapes out.")
-    if cached > mapped:
+    if cached > mapped and traced > TRACED_ON:
+        found.append(
+            "Few rays come to use the map, with this cube, a smaller or a larger one: many hit "
+            "something inside it, and many are traced on. no_cluster leaves its shapes out."
+        )
+    elif cached > mapped:
         found.append(
             "More rays hit something inside the cube than come to use the map: lower "
             f"{ratio}, or list fewer shapes that lie closer together."
         )
-    if traced > TRACED_ON:
+    elif traced > TRACED_ON:
         found.append(
             "Many rays are traced on: what lies beyond the cube looks different from different "
             f"places of the cluster, or its surfaces nearly touch. Raise {ratio}, or list fewer "
@@ -96,7 +102,7 @@ def as_xml(view: ClusterView) -> str:
     Nothing if its shapes have no ids.
     """
     cluster = view.cluster
-    ids = ", ".join(list(filter(None, view.shapes))[:MOST_SHAPES])
+    ids = _ids(view)
     if not ids:
         return ""
     return (
@@ -105,3 +111,19 @@ def as_xml(view: ClusterView) -> str:
         f'    <float name="distance_ratio" value="{cluster.half_width / cluster.radius:.3g}"/>\n'
         "</emitter>"
     )
+
+
+def as_flags(view: ClusterView) -> str:
+    """Flags of ``envmap-render`` that ask for the same, and that leave its shapes out."""
+    cluster, ids = view.cluster, _ids(view)
+    if not ids:
+        return ""
+    name, ratio = shlex.quote(cluster.name), cluster.half_width / cluster.radius
+    return (
+        f"--set {name}.shapes={shlex.quote(ids)} --set {name}.distance_ratio={ratio:.3g}\n"
+        f"--set no_cluster={shlex.quote(ids)}"
+    )
+
+
+def _ids(view: ClusterView) -> str:
+    return ", ".join(list(filter(None, view.shapes))[:MOST_SHAPES])

@@ -19,6 +19,16 @@ from .wires import Wires, wires
 
 #: Ends of the scale of relative errors.
 LEAST_ERROR, MOST_ERROR = 0.01, 1.0
+#: What rays of each kind of ``system.ray_counts`` are for.
+RAYS = {
+    "primary": "of the camera",
+    "shadow": "to sources",
+    "secondary": "of surfaces, as far as a cube",
+    "unbounded": "of surfaces, in full",
+    "retraced": "traced on where a map wasn't trusted",
+    "source": "for sources beyond a cube",
+    "survey": "for where surfaces are",
+}
 
 
 @dataclass(frozen=True)
@@ -31,7 +41,7 @@ class Shown:
     radiance, distance  URIs of its unfolded map
     near, far        ends of the scale of distances
     shapes           its largest shapes, and how many there are
-    remarks, xml     see ``advice``
+    remarks, xml, flags  see ``advice``
     """
 
     view: ClusterView
@@ -45,6 +55,7 @@ class Shown:
     n_shapes: int
     remarks: list[str]
     xml: str
+    flags: str
 
 
 def load_template() -> Any:
@@ -95,18 +106,27 @@ def page(
         error=embedded(np.where(lit[..., None], on_ramp(error, LEAST_ERROR, MOST_ERROR), 0)),
         usual_error=float(np.median(error[lit])) if lit.any() else 0.0,
         unknown=float((view.aovs["patch"].max(axis=2) == 0).mean()),
-        served=embedded(eight_bits(aovs["served"])),
+        served=embedded(_served(aovs)),
         shares=view.aovs["served"].mean(axis=(0, 1)).tolist(),
+        near=float(view.aovs["near"].mean()),
+        kinds=RAYS,
         ramp=ramp_css(),
         width=width,
         height=height,
         objects=embedded(_objects(picture, white, with_maps)),
-        served_by_maps=embedded(eight_bits(shrunk(with_maps.aovs["served"]))),
+        served_by_maps=embedded(_served({n: shrunk(p) for n, p in with_maps.aovs.items()})),
         clusters=_clusters(with_maps, scene, sensor),
         faces=Faces.of(sensor).names(),
         look_up_cost=LOOK_UP_COST,
         settings=settings,
     )
+
+
+def _served(aovs: dict[str, np.ndarray]) -> np.ndarray:
+    """Where secondary rays end, in four colours: of those traced on, the near ones are yellow."""
+    colours = aovs["served"].copy()
+    colours[..., 1] += aovs["near"][..., 0]
+    return eight_bits(colours)
 
 
 def _objects(picture: np.ndarray, white: float, view: View) -> np.ndarray:
@@ -137,6 +157,7 @@ def _clusters(view: View, scene: mi.Scene, sensor: mi.Sensor) -> list[Shown]:
                 n_shapes=len(shapes),
                 remarks=advice.about_cluster(cluster),
                 xml=advice.as_xml(cluster),
+                flags=advice.as_flags(cluster),
             )
         )
     return shown

@@ -6,7 +6,7 @@ import hashlib
 import math
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import drjit as dr
 import mitsuba as mi
@@ -26,7 +26,7 @@ from ..imaging.film import (
     put_plain,
 )
 from ..imaging.progress_file import Progress, planned_samples, progress_of, stored_progress
-from ..imaging.progressive import Improving, improve
+from ..imaging.progressive import Improving, Renderer, improve
 from ..lookup.far_field import FarField
 from ..lookup.lookup import Lookup
 from ..preparation.baked_state import BakedState, Settings, StateKey, load
@@ -257,19 +257,28 @@ class CachedIntegrator(mi.SamplingIntegrator):
         return picture
 
     def pixel_sums(
-        self, scene: mi.Scene, sensor: mi.Sensor, seed: int, spp: int, pixels: range
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        seed: int,
+        spp: int,
+        pixels: range,
+        first: int = 0,
+        planned: int = 0,
     ) -> Sums:
         """What ``render`` puts to the film for some pixels, of ``imaging.film.pixel_ranges``.
 
-        ``put`` makes the picture of all of them, the same to the bit. Raises ``ValueError`` as
-        ``prepare`` does, and if ``sampler`` isn't ``coherent``.
+        ``put`` makes the picture of all of them, the same to the bit. Of a picture that is to have
+        more samples than these ``spp``, ``planned`` is their number, and ``first`` the index of the
+        first of these. Raises ``ValueError`` as ``prepare`` does, and if ``sampler`` isn't
+        ``coherent``.
         """
         self.require_coherent("renders all pixels at once")
-        now, baked = self._ready(scene, sensor, spp)
+        now, baked = self._ready(scene, sensor, planned or spp)
         with dr.suspend_grad():
-            lookup, recorder = self._lookup(scene, now, baked, spp)
+            lookup, recorder = self._lookup(scene, now, baked, planned or spp)
             shading = Shading(scene, lookup, self.rules(seed), self.sample_aovs())
-            return self.sums(sensor, None, spp, seed, shading, recorder, pixels=pixels)
+            return self.sums(sensor, None, spp, seed, shading, recorder, first, pixels)
 
     def require_coherent(self, otherwise: str) -> None:
         """Raise ``ValueError`` unless sample points are our own: others do ``otherwise``."""
@@ -287,6 +296,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
         target_error: float = 0.0,
         progress_file: str | os.PathLike | None = None,
         resume: bool = False,
+        elsewhere: Callable[[BakedState, int], Renderer] | None = None,
     ) -> Iterator[Improving]:
         """Render a sensor in passes of ``spp`` samples per pixel.
 
@@ -298,6 +308,9 @@ class CachedIntegrator(mi.SamplingIntegrator):
         ``progress_file`` keeps what has been rendered, from every picture and from Ctrl-C on. With
         ``resume`` it goes on from there, to the same bits as if it hadn't ended. If ``total`` is
         another one then, the pre-passes remain those for the first.
+
+        ``elsewhere(state, planned)`` gives what renders passes in place of this process, from a
+        baked state, of a picture that is to have so many samples: see ``distributed``.
 
         Raises ``ValueError`` as ``prepare`` does, if ``sampler`` isn't ``coherent``, and for a
         ``progress_file`` that is missing, damaged, or of another scene, sensor or setting.
@@ -314,10 +327,10 @@ class CachedIntegrator(mi.SamplingIntegrator):
         made_for = self._made_with(sensor, baked, seed, spp)
         progress = progress_of(stored, made_for, size) if stored else Progress.none(planned)
 
-        def send(stream, first, n):
-            seed_ = 2 * seed + stream & 0xFFFFFFFF
-            shading = Shading(scene, lookup, self.rules(seed_), self.sample_aovs())
-            return self.sums(sensor, None, n, seed_, shading, recorder, first)
+        def here(passes):
+            for _, its, first, n in passes:
+                shading = Shading(scene, lookup, self.rules(its), self.sample_aovs())
+                yield self.sums(sensor, None, n, its, shading, recorder, first)
 
         def develop(sums, n_samples):
             self.put(sensor, sums, n_samples)
@@ -329,8 +342,9 @@ class CachedIntegrator(mi.SamplingIntegrator):
             if progress_file is not None:
                 progress.save(progress_file, made_for, size)
 
+        render = elsewhere(baked, planned) if elsewhere else here
         return improve(
-            send, develop, keep, progress, spp, total, deadline, target_error, state=baked
+            render, develop, keep, progress, seed, spp, total, deadline, target_error, state=baked
         )
 
     def _made_with(self, sensor, baked: BakedState, seed: int, spp: int) -> dict[str, object]:

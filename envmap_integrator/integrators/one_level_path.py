@@ -47,7 +47,8 @@ class OneLevelPath(GatheringIntegrator):
        - AOVs as in Mitsuba's :monosp:`aov`, such as ``p:patch, s:served``: ``patch`` and
          ``cluster``, a colour for each; ``irradiance``, ``indirect_irradiance``,
          ``irradiance_error``: what the cache holds, and its standard error [W/m²]; ``served``: part
-         of the secondary rays that were traced on (R), ended in the cache (G) or in a map (B).
+         of the secondary rays that were traced on (R), ended in the cache (G) or in a map (B);
+         ``near``: part of them traced on as what they hit was too near for the cache.
          (Default: none)
      * - clamp_indirect
        - |float|

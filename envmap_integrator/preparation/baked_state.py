@@ -93,7 +93,10 @@ class StateKey:
         theirs, ours = _flat(settings), _flat(_plain(self.settings))
         for name in ours | theirs:
             if theirs.get(name) != ours.get(name):
-                return f"made with {name}={theirs.get(name)!r}, not {name}={ours.get(name)!r}"
+                return (
+                    f"made with {name}={theirs.get(name)!r}, not {name}={ours.get(name)!r} "
+                    "(pass the same settings as there)"
+                )
         return ""
 
 

@@ -22,7 +22,8 @@ class Service:
     """What the cache does at a surface.
 
     served     whether it ends the path there, in its wide lobes,
-    residual   ... or could, but the path goes on to estimate what is wrong with that
+    residual   ... or could, but the path goes on to estimate what is wrong with that,
+    near       ... or would, were the surface not too near for a coarse mesh
     boost      [1]  factor on what such a path brings
     own        the patch that the surface lies in
     row        of the irradiance table that stands for what wide lobes gather
@@ -31,6 +32,7 @@ class Service:
 
     served: mi.Bool
     residual: mi.Bool
+    near: mi.Bool
     boost: mi.Float
     own: mi.UInt32
     row: mi.UInt32
@@ -69,7 +71,7 @@ def serve(
         lit=lit & served, alone=could & ~(residual & lit), boost=dr.select(lit, boost, 1)
     )
     row = 2 * patch.index + dr.select(lit, mi.UInt32(0), mi.UInt32(1))
-    return Service(served, residual, boost, patch.own, row, share)
+    return Service(served, residual, patch.found & near, boost, patch.own, row, share)
 
 
 def record_end(

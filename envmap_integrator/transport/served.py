@@ -18,10 +18,11 @@ from .vertex import Vertex
 
 def served(
     scene: mi.Scene, lookup: Lookup, rules: PathRules, sampler: mi.Sampler, vertex: Vertex
-) -> tuple[mi.Float, mi.Float, mi.Float]:
+) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float]:
     """Whether a secondary ray from ``vertex`` is traced on, ends in the cache or in a map.
 
-    Three numbers of which at most one is 1; none where the ray leaves the scene. It is a ray of its
+    Three numbers of which at most one is 1; none where the ray leaves the scene. The fourth is 1
+    where it's traced on since what it hits is too near for the cache. It is a ray of its
     own, as others are sent, so that their paths, and the picture, don't depend on whether anybody
     wants to know.
     """
@@ -35,6 +36,8 @@ def served(
         met = look_up_far(scene, lookup.far_field, path, si, estimates, spare)
     end = Vertex.met(lookup, met.si, path.ray, path.active & ~met.mapped)
     in_cache = end.hit & ~met.retraced
-    in_cache &= serve(lookup, rules, start, path, end, estimates, spare).served
+    service = serve(lookup, rules, start, path, end, estimates, spare)
+    in_cache &= service.served
     traced_on = met.retraced | (end.hit & ~in_cache)
-    return tuple(dr.select(x, mi.Float(1), 0) for x in (traced_on, in_cache, met.mapped))
+    near = traced_on & ~met.retraced & service.near
+    return tuple(dr.select(x, mi.Float(1), 0) for x in (traced_on, in_cache, met.mapped, near))

@@ -124,6 +124,9 @@ def test_rays_of_a_cluster_end_in_its_map(scene):
     assert served[ball, 2].mean() > 0.3 > 10 * served[walls, 2].mean()
     assert served[walls, 1].mean() > 0.6
     assert served.sum(axis=-1).max() <= 1 + 1e-5 and served.sum(axis=-1).mean() > 0.95
+    near = found["near"][..., 0]  # Part of those that are traced on: where walls meet, above all.
+    assert (near <= served[..., 0] + 1e-5).all() and near[ball].mean() < 0.1
+    assert near.max() > 0.3 and near.mean() > 0.3 * served[..., 0].mean()
 
 
 def test_mirrors_show_what_is_seen_in_them():

@@ -287,7 +287,8 @@ def test_stage_times_of_the_pre_pass_are_reported(scene, preparing_integrator, c
     assert run("render", scene, "--integrator", preparing_integrator) == 0
     times = json.loads(header(scene.with_suffix(".exr"))["stage_times"])
     assert times["radiosity"] == 1.25
-    assert "radiosity" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "radiosity" in told and f"by {preparing_integrator} with " in told
 
 
 def test_bake_saves_the_state(scene, preparing_integrator, tmp_path, capsys):
@@ -305,6 +306,7 @@ def test_bake_saves_the_state(scene, preparing_integrator, tmp_path, capsys):
         (("-D", "radiant=3"), "remove -D radiant"),
         (("--set", "max_dept=3"), "max_dept"),
         (("--set", "max_depth=deep"), "give it as integer"),
+        (("--set", "cache_file=state.exr"), "path has no such parameter: pass --integrator envmap"),
         (("--integrator", "no_such_plugin"), '"no_such_plugin" not found'),
         (("-s", "1"), "-s/--sensor 1 is out of range"),
         (("-t", "0"), "-t/--threads must be at least 1"),

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import itertools
+import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -19,8 +22,9 @@ import pytest
 from distributed import Client, LocalCluster, Status
 
 from envmap_integrator.cli import main
-from envmap_integrator.distributed import cluster, render, tasks
+from envmap_integrator.distributed import cluster, progressive, render, tasks
 from envmap_integrator.distributed.job import Job, View
+from envmap_integrator.distributed.progressive import progressive_distributed
 from envmap_integrator.distributed.render import check_workers, render_distributed, render_views
 from envmap_integrator.imaging.film import pixel_ranges
 from envmap_integrator.system.scene_file import SceneFile
@@ -74,8 +78,9 @@ def by_workers(client, **more) -> np.ndarray:
 def many_parts(monkeypatch):
     """Renders are cut into about 25 parts."""
     with monkeypatch.context() as patch:
-        patch.setattr(render, "LEAST_SAMPLES", MANY_PARTS)
-        patch.setattr(render, "MOST_SAMPLES", MANY_PARTS)
+        for module in (render, progressive):
+            patch.setattr(module, "LEAST_SAMPLES", MANY_PARTS)
+            patch.setattr(module, "MOST_SAMPLES", MANY_PARTS)
         yield
 
 
@@ -171,14 +176,46 @@ def test_several_views(client, at_once):
     assert not np.array_equal(pictures[1], pictures[0])
 
 
-def test_in_the_shell(in_one_process, tmp_path, capsys):
+def test_better_and_better_pictures(client, tmp_path, monkeypatch):
+    """All of them, and what is kept to go on from, whoever has begun with it."""
+    scene_file = SceneFile(SCENE, PARAMETERS)
+    scene_file.configure_integrator("envmap_hybrid", SETTINGS)
+    scene = scene_file.load(merge_meshes=False)
+    here, there = tmp_path / "here.exr", tmp_path / "there.exr"
+    passes = {"seed": 3, "spp": 4, "total": SPP}
+    expected = scene.integrator().progressive(scene, progress_file=here, **passes)
+    expected = [(better.spp, better.error, better.picture.numpy()) for better in expected]
+    halfway = scene.integrator().progressive(scene, progress_file=there, **passes)
+    found = [next(halfway), next(halfway)]
+    halfway.close()
+    with many_parts(monkeypatch):
+        rest = progressive_distributed(
+            SCENE, client, integrator="envmap_hybrid", settings=SETTINGS, parameters=PARAMETERS,
+            progress_file=there, resume=True, **passes,
+        )  # fmt: skip
+        assert next(rest).spp == found[1].spp  # What there is already.
+        found += rest
+    assert [(better.spp, better.error) for better in found] == [(n, e) for n, e, _ in expected]
+    for better, (_, _, picture) in zip(found, expected, strict=True):
+        assert np.array_equal(better.picture.numpy(), picture)
+    assert here.read_bytes() == there.read_bytes()
+
+
+@pytest.mark.parametrize("progressive", [False, True])
+def test_in_the_shell(in_one_process, tmp_path, capsys, progressive):
     options = [arg for key, value in PARAMETERS.items() for arg in ("-D", f"{key}={value}")]
     options += ["--integrator", "envmap_hybrid", "--set", "patches=1024"]
     options += ["--spp", str(SPP), "--seed", "3", "--workers", "1"]
+    options += ["--progressive"] if progressive else []
     output = tmp_path / "room.exr"
     assert main(["render", str(SCENE), *options, "-o", str(output)]) == 0
-    assert "find workers" in capsys.readouterr().out
-    assert np.array_equal(np.array(mi.Bitmap(str(output))), in_one_process[1])
+    told = capsys.readouterr().out
+    assert "find workers" in told
+    if progressive:  # Another sequence of samples.
+        assert told.startswith("16 samples per pixel, ") and f"{SPP} samples per pixel, " in told
+        assert list(mi.Bitmap(str(output)).size()) == [80, 60]
+    else:
+        assert np.array_equal(np.array(mi.Bitmap(str(output))), in_one_process[1])
 
 
 def test_ctrl_c(tmp_path):
@@ -290,6 +327,90 @@ def test_workers_that_lack_something(options, message):
         with pytest.raises(ValueError, match="^worker tcp://") as caught:
             check_workers(one, Job.of(SCENE))
     assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+# ---------------------- Another program's cluster ----------------------
+
+
+@pytest.fixture(scope="module")
+def certificates(tmp_path_factory) -> dict[str, str]:
+    """Files by their names: an authority's certificate, one that it has signed, and a key for it;
+    the same of another authority.
+    """
+    if not shutil.which("openssl"):
+        pytest.skip("makes certificates with openssl")
+    folder = tmp_path_factory.mktemp("certificates")
+
+    def openssl(*arguments: str) -> None:
+        subprocess.run(["openssl", *arguments], cwd=folder, check=True, capture_output=True)
+
+    curve = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes")
+    for authority in ("ca", "other"):
+        openssl(
+            "req", "-x509", *curve, "-subj", f"/CN={authority}", "-keyout", "x", "-out", authority
+        )
+        openssl("req", *curve, "-subj", "/CN=us", "-keyout", f"{authority}-key", "-out", "request")
+        openssl(
+            *("x509", "-req", "-in", "request", "-CA", authority, "-CAkey", "x"),
+            *("-CAcreateserial", "-out", f"{authority}-signed"),
+        )
+    return {file.name: str(file) for file in folder.iterdir()}
+
+
+@pytest.fixture(scope="module")
+def farm(certificates, tmp_path_factory) -> Iterator[str]:
+    """Address of a scheduler with TLS, which was started in a shell, with a worker."""
+    folder = tmp_path_factory.mktemp("farm")
+    ca, certificate, key = (certificates[name] for name in ("ca", "ca-signed", "ca-key"))
+    tls = ["--tls-ca-file", ca, "--tls-cert", certificate, "--tls-key", key, "--no-dashboard"]
+    dask = [sys.executable, "-m", "dask"]
+    local = ["--protocol", "tls", "--host", "127.0.0.1", "--port", "0"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    file = folder / "scheduler.json"
+    started = []
+
+    def start(*arguments: str) -> None:
+        started.append(
+            subprocess.Popen(
+                [*dask, *arguments, *tls], cwd=folder, env=environment,
+                stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            )
+        )  # fmt: skip
+
+    try:
+        start("scheduler", *local, "--scheduler-file", str(file))
+        start("worker", "--scheduler-file", str(file), "--nthreads", "1", "--no-nanny")
+        while not file.exists():
+            assert started[0].poll() is None
+            time.sleep(0.1)
+        time.sleep(0.1)
+        yield json.loads(file.read_text())["address"]
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
+
+
+def test_certificates(farm, certificates, at_once):
+    """A worker of a scheduler that knows us by our certificate; both are elsewhere."""
+    ours = [certificates[name] for name in ("ca", "ca-signed", "ca-key")]
+    with cluster.connected(farm, ours) as client:
+        assert farm.startswith("tls://")
+        assert np.array_equal(by_workers(client), at_once)
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (("ca", "other-signed", "other-key"), "must be signed by the authority that both name"),
+        (("other", "ca-signed", "ca-key"), "must be signed by the authority that both name"),
+        (("ca", "ca-signed", "other-key"), "give the authority's certificate, yours, and your key"),
+    ],
+)
+def test_wrong_certificates(farm, certificates, names, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        cluster.connected(farm, [certificates[name] for name in names]).__enter__()
+    assert "\n" not in str(caught.value)
 
 
 # ---------------------- Calls ----------------------

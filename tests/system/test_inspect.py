@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import re
+import shlex
 from pathlib import Path
 
 import drjit as dr
@@ -13,14 +14,14 @@ import numpy as np
 import pytest
 
 from envmap_integrator.cli import main
-from envmap_integrator.inspection.advice import about_cluster, as_xml, in_short
+from envmap_integrator.inspection.advice import about_cluster, as_flags, as_xml, in_short
 from envmap_integrator.inspection.pictures import RAMP, embedded, on_ramp, shrunk, tone_mapped
 from envmap_integrator.inspection.survey import ClusterView, survey
 from envmap_integrator.inspection.unfolded import MASKED, SKY, Faces, unfolded
 from envmap_integrator.inspection.wires import wires
 from envmap_integrator.lookup.cube import face_to_direction
 from envmap_integrator.lookup.cube_map import Cluster, CubeMap
-from tests.helpers import camera, integrator, load, room
+from tests.helpers import camera, cluster, integrator, load, room
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -128,6 +129,19 @@ def test_a_survey_is_of_the_render_asked_for():
     assert seen and set().union(*(view.shapes for view in seen)) <= {"block", "ball", "lamp"}
     assert 0 < found.patches[0] <= 2 * ours.patches
     assert len(in_short(found)) >= 3
+    assert found.rays["primary"] == pytest.approx(1, rel=0.01)
+    assert found.rays["unbounded"] > 0.5 and "survey" not in found.rays
+
+
+def test_clusters_that_are_not_seen_are_named():
+    """A sensor that looks away from the ball, which another one sees."""
+    away = camera(16, 12, origin=(0, 0, -1), target=(-9, 0, -1))
+    scene = load(room(sensor2=away))
+    ours = integrator("envmap_hybrid", sampler="coherent", desk=cluster("ball"))
+    index = [sensor.film().size()[0] for sensor in scene.sensors()].index(16)
+    (view,) = survey(scene, scene.sensors()[index], ours, 4, 0).view.clusters
+    assert view.seen == 0 and view.shapes == {"ball": 0.0}
+    assert "no_cluster" in " ".join(about_cluster(view))
 
 
 def test_warnings_are_kept():
@@ -257,12 +271,14 @@ def test_scales():
         ((0.1, 0.2, 0.7), 0.5, "Nothing odd"),
         ((0.1, 0.7, 0.2), 0.5, "lower distance_ratio (here 2)"),
         ((0.5, 0.1, 0.4), 0.5, "Raise distance_ratio (here 2)"),
+        ((0.4, 0.4, 0.2), 0.5, "no_cluster leaves its shapes out"),
         ((0.1, 0.2, 0.7), 0.95, "95\u00a0% of the map is behind walls"),
     ],
 )
 def test_advice(served, masked, words):
     view = ClusterView(cube((0, 0, 0), 1), masked, {"ball & co": 0.1, "": 0.2}, 0.1, served)
     assert words in " ".join(about_cluster(view))
+    assert not {"lower", "Raise"} <= set(" ".join(about_cluster(view)).split())
     # What it gives to be changed by hand loads.
     text = as_xml(view)
     loaded = mi.load_string(
@@ -270,3 +286,5 @@ def test_advice(served, masked, words):
     ).integrator()
     assert loaded.requests[0].shapes == ("ball & co",)
     assert loaded.requests[0].distance_ratio == 2
+    assert shlex.split(as_flags(view))[1] == "cluster0.shapes=ball & co"
+    assert shlex.split(as_flags(view))[-1] == "no_cluster=ball & co"

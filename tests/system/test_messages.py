@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import asyncio
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ from envmap_integrator.distributed import tasks
 from envmap_integrator.distributed.cluster import connected as cluster_at
 from envmap_integrator.distributed.job import View
 from envmap_integrator.distributed.render import check_workers, render_job
+from envmap_integrator.distributed.tasks import workers_of
 from envmap_integrator.distributed.worker import Outcome
 from envmap_integrator.imaging import film
 from envmap_integrator.imaging.aovs import parse_aovs
@@ -364,8 +366,15 @@ class Ended:
 
 def crew(workers: dict | None = None, **client: object) -> tasks._Crew:
     """One that has sent a single call to a cluster that isn't there."""
-    here = {"status": "running", "scheduler": SimpleNamespace(address="tcp://here:1")}
-    here["scheduler_info"] = lambda: {"workers": workers or {}}
+
+    async def identity(n_workers: int):
+        return {"workers": workers or {}}
+
+    def sync(function: Callable, *arguments: object, callback_timeout: float | None = None):
+        return asyncio.run(function(*arguments))
+
+    scheduler = SimpleNamespace(address="tcp://here:1", identity=identity)
+    here = {"status": "running", "scheduler": scheduler, "sync": sync}
     sent = tasks._Crew(SimpleNamespace(**here | client), None, [()], 9.0, None)
     sent.pending[0] = Ended()
     return sent
@@ -386,9 +395,9 @@ def died() -> KilledWorker:
     return KilledWorker("call", SimpleNamespace(address="tcp://there:2"), 3)
 
 
-def looked_after(**client: object) -> Callable:
+def looked_after(workers: dict | None = None, **client: object) -> Callable:
     def action(_):
-        sent = crew(**client)
+        sent = crew(workers, **client)
         sent.last_look = sent.last_worker = -100.0
         sent.look_after_workers()
 
@@ -398,7 +407,7 @@ def looked_after(**client: object) -> Callable:
 def hung(_: Surroundings) -> None:
     sent = crew(workers={"tcp://there:2": {}})
     sent.tries[0] = tasks.MOST_TRIES
-    sent._give_up("tcp://there:2", [0])
+    sent._give_up("tcp://there:2", [0], 9.0)
 
 
 def nobody_comes(_: Surroundings) -> None:
@@ -408,11 +417,35 @@ def nobody_comes(_: Surroundings) -> None:
     check_workers(crew(wait_for_workers=wait).client, None)
 
 
-def another_version(_: Surroundings) -> None:
-    def run(*_, on_error: str):
-        return {"tcp://there:2": "has mitsuba 3.8.0 instead of 3.9.1; install that version there"}
+def scheduler_at(address: str, tls: tuple | None = None) -> Callable:
+    return lambda _: cluster_at(address, tls).__enter__()
 
-    check_workers(crew(wait_for_workers=lambda *_, timeout: None, run=run).client, None)
+
+def scheduler_that_fails(reason: str) -> Callable:
+    def client(*_, **__):
+        raise OSError(reason)
+
+    def action(s):
+        s.patch.setattr("envmap_integrator.distributed.cluster.Client", client)
+        cluster_at("tcp://there:1").__enter__()
+
+    return action
+
+
+def another_version(_: Surroundings) -> None:
+    async def run(*_, workers: list[str], on_error: str):
+        fault = "has mitsuba 3.8.0 instead of 3.9.1; install that version there"
+        return dict.fromkeys(workers, fault)
+
+    there = {"tcp://there:2": {}}
+    check_workers(crew(there, wait_for_workers=lambda *_, timeout: None, run=run).client, None)
+
+
+def silent_scheduler(_: Surroundings) -> None:
+    def sync(function: Callable, callback_timeout: float):
+        raise TimeoutError
+
+    workers_of(crew(sync=sync).client)
 
 
 def in_parts(kind: str, **settings: object) -> Callable:
@@ -661,13 +694,45 @@ CASES = {
     "no scheduler any more": Case(
         looked_after(status="closed"), "tcp://here:1", "scheduler is gone", "start it again"
     ),
+    "a scheduler that hangs": Case(
+        silent_scheduler, "tcp://here:1", "doesn't answer", "start it again"
+    ),
     "no worker any more": Case(
         looked_after(), "tcp://here:1", "no worker is left", "start some there"
     ),
+    "no worker that has memory": Case(
+        looked_after({"tcp://there:2": {"status": "paused"}}),
+        "worker tcp://there:2", "short of its memory limit", "dask worker --memory-limit",
+    ),
     "no worker": Case(nobody_comes, "tcp://here:1", "no worker has come within 60 s", "start some"),
     "no scheduler": Case(
-        lambda _: cluster_at("tcp://127.0.0.1:x").__enter__(),
-        "tcp://127.0.0.1:x", "no scheduler answers", "start one with: dask scheduler",
+        scheduler_that_fails("[Errno 111] refused"),
+        "tcp://there:1", "no scheduler answers", "start one with: dask scheduler",
+    ),
+    "a scheduler with TLS": Case(
+        scheduler_that_fails("ConnectionResetError: reset by peer"),
+        "tcp://there:1", "no scheduler answers", "use its address tls://there:1",
+    ),
+    "certificates of others": Case(
+        scheduler_that_fails("TLS certificate does not match"),
+        "tcp://there:1", "certificate does not match", "signed by the authority that both name",
+    ),
+    "no address": Case(scheduler_at("render-1"), "a scheduler", '"render-1"', "tcp://render-1:8786"),
+    "certificates without TLS": Case(
+        scheduler_at("tcp://there:1", ("ca", "cert", "key")), "certificates", "tcp://", "tls://"
+    ),
+    "TLS without certificates": Case(
+        scheduler_at("tls://there:1"), "tls://there:1", "certificates", "pass --tls CA CERT KEY"
+    ),
+    "missing certificates": Case(
+        scheduler_at("tls://there:1", ("none.pem", "none.pem", "none.pem")),
+        "no file", "none.pem", "takes CA, CERT and KEY",
+    ),
+    "damaged certificates": Case(
+        scheduler_at("tls://there:1", (__file__,) * 3), "TLS files", "test_messages.py", "your key"
+    ),
+    "certificates for nobody": Case(
+        shell(commands.render, tls=["ca", "cert", "key"]), "--tls", "--cluster", "leave it out"
     ),
     "path in parts": Case(
         in_parts("path"), "MonteCarloIntegrator", "in parts", "take envmap_hybrid"
@@ -679,10 +744,6 @@ CASES = {
     "another sensor": Case(no_such_sensor, "sensor 3", "the scene has 1", "count from 0"),
     "no Dask": Case(without_dask, "Dask", "is missing", "pip install distributed"),
     "no workers": Case(shell(commands.render, workers=0), "--workers", "0", "must be at least 1"),
-    "workers and progress": Case(
-        shell(commands.render, integrator="envmap_hybrid", workers=2, time=1.0),
-        "--workers", "one picture", "leave out --progressive, --time and --target-error",
-    ),
     "nothing to bake": Case(
         shell(commands.bake), "integrator", '"path"', "pass --integrator envmap_hybrid"
     ),

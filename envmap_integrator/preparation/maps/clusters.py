@@ -113,7 +113,7 @@ def shapes_named(scene: mi.Scene, names: tuple[str, ...], owner: str) -> np.ndar
             known = sorted(ids, key=lambda id_: -SequenceMatcher(None, name, id_).ratio())
             raise ValueError(
                 f'{owner}: the scene has no shape "{name}"; it has {_some(known)} '
-                "(Mitsuba merges meshes that share a material: load with optimize=False)"
+                "(in Python, load with optimize=False: Mitsuba merges meshes that share a material)"
             )
     return np.isin(ids, names)
 
