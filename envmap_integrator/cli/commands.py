@@ -20,6 +20,7 @@ from envmap_integrator.cli import workers
 from envmap_integrator.cli.output import write_bitmap, write_png
 from envmap_integrator.cli.timing import compilation_time, measure, record_kernels
 from envmap_integrator.imaging.denoiser import denoise, prepare_for_denoiser, warm_up
+from envmap_integrator.imaging.film import has_bands
 from envmap_integrator.imaging.progressive import Improving
 from envmap_integrator.inspection.page import load_template, page
 from envmap_integrator.inspection.survey import survey
@@ -40,6 +41,11 @@ def render(args: argparse.Namespace) -> int:
         # Merged meshes have another order in each process.
         scene_file, scene = _load(args, seconds, merge_meshes=not _by_workers(args))
         sensor = _sensor(scene, args.sensor)
+        _require(
+            not (has_bands(sensor.film()) and (args.denoise or args.png)),
+            "--denoise and --png need colour, the film holds bands: leave them out, or take a "
+            "hdrfilm",
+        )
         settings = _settings(args, scene_file, scene, sensor)
         more: dict[str, float] = {}
         with ExitStack() as stack:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -21,6 +22,7 @@ from ..preparation.maps.interchange import (
 from ..system.checks import check_variant, misplaced
 from ..system.jit import upload, upload_vectors
 from ..system.parameters import Parameters
+from ..system.spectrum import n_stored, read_at, read_rgb, row_of
 from ..system.storage import StorageError, is_ours, read
 
 _MADE_BY = "make it with envmap-render bake"
@@ -108,20 +110,33 @@ class MipmapCube(mi.Emitter):
 
     def eval(self, si: mi.SurfaceInteraction3f, active: mi.Bool | bool = True) -> mi.Spectrum:
         """Radiance [W/m²/sr] that arrives from ``-si.wi``, at the emitter's level."""
-        return self.eval_level(-si.wi, self.level, active)
+        return self.eval_level(-si.wi, self.level, active, si.wavelengths)
 
     def eval_level(
-        self, direction: mi.Vector3f, level: float, active: mi.Bool | bool = True
-    ) -> mi.Spectrum:
-        """Radiance [W/m²/sr] from world space directions at any level, trilinearly filtered."""
+        self,
+        direction: mi.Vector3f,
+        level: float,
+        active: mi.Bool | bool = True,
+        wavelengths: mi.Color0f | mi.Spectrum | None = None,
+    ) -> mi.Spectrum | mi.Color3f:
+        """Radiance [W/m²/sr] from world space directions at any level, trilinearly filtered.
+
+        In spectral variants at ``wavelengths`` [nm], or else the colour that films would hold.
+        """
         self._require_map()
+
+        def fetch(index):
+            if mi.is_spectral and wavelengths is None:
+                return mi.Color3f(*read_rgb(self._texels, partial(row_of, index), active))
+            return read_at(self._texels, partial(row_of, index), wavelengths, active)
+
         direction = self._to_world.T @ direction
         top = self.n_levels - 1
         level = min(max(level, 0.0), float(top))
         fine = int(level)
-        value = self._bilinear(direction, fine, active)
+        value = self._bilinear(direction, fine, fetch)
         if level > fine:
-            value = dr.lerp(value, self._bilinear(direction, fine + 1, active), level - fine)
+            value = dr.lerp(value, self._bilinear(direction, fine + 1, fetch), level - fine)
         return value
 
     def sample_direction(
@@ -146,7 +161,7 @@ class MipmapCube(mi.Emitter):
         ds.delta = False
         ds.emitter = mi.EmitterPtr(self)
         ds.time = it.time
-        value = self.eval_level(d, self.level, active)
+        value = self.eval_level(d, self.level, active, it.wavelengths)
         return ds, dr.select(ds.pdf > 0, value / ds.pdf, 0) & active
 
     def pdf_direction(
@@ -160,7 +175,7 @@ class MipmapCube(mi.Emitter):
         self, it: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool | bool = True
     ) -> mi.Spectrum:
         """Radiance [W/m²/sr] from a direction."""
-        return self.eval_level(ds.d, self.level, active)
+        return self.eval_level(ds.d, self.level, active, it.wavelengths)
 
     # ---------------------- Files ----------------------
 
@@ -198,10 +213,10 @@ class MipmapCube(mi.Emitter):
 
     def _prepare_evaluation(self, levels: list[np.ndarray]):
         n_channels = levels[0].shape[-1]
-        if n_channels != len(mi.Spectrum()):
+        if n_channels != n_stored():
             raise ValueError(
                 f"mipmap_cube: the map has {n_channels} colour channels, variant {mi.variant()} "
-                f"needs {len(mi.Spectrum())}; bake it with this variant, or use another one"
+                f"needs {n_stored()}; bake it with this variant, or use another one"
             )
         self.n_levels, self.resolution = len(levels), levels[0].shape[1]
         self._texels = upload(mi.Float, np.concatenate([np.ravel(level) for level in levels]))
@@ -220,7 +235,7 @@ class MipmapCube(mi.Emitter):
         solid_angle = 4 / resolution**2 / (1 + dr.squared_norm(uv)) ** 1.5
         return self._distribution.eval_pmf_normalized(index, active) / solid_angle
 
-    def _bilinear(self, direction, level: int, active):
+    def _bilinear(self, direction, level: int, fetch):
         """Four texels around a direction, each found through its own direction: no seams.
 
         Only three texels meet at a corner of the cube; their mean stands for the fourth.
@@ -237,8 +252,7 @@ class MipmapCube(mi.Emitter):
             face_, uv_ = direction_to_face(face_to_direction(face, centre))
             index = texel(face_, uv_, resolution, mi.UInt32(size))
             weight = (w.x if dx else 1 - w.x) * (w.y if dy else 1 - w.y)
-            value = dr.gather(mi.Spectrum, self._texels, index, active)
-            texels.append((weight, value, dr.all(dr.abs(centre) > 1)))
+            texels.append((weight, fetch(index), dr.all(dr.abs(centre) > 1)))
         total = sum(value for _, value, _ in texels)
         return sum(
             weight * dr.select(missing, (total - value) / 3, value)

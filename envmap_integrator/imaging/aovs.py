@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..lookup.lookup import Lookup
-from ..system.jit import mix, rgb, unit
+from ..system.jit import mix, unit
 from ..transport.camera import CameraSample, camera_radiance
 from ..transport.rules import PathRules
 from ..transport.served import served
@@ -104,9 +104,9 @@ def _values(
                 shade = dr.select(patch.found, dr.select(patch.even, 1, UNEVEN), 0)
                 return tuple(shade * c for c in false_colour(patch.index))
             case "irradiance":
-                return rgb(cache.irradiance(2 * patch.index, patch.found))
+                return cache.rgb(2 * patch.index, patch.found)
             case "indirect_irradiance":
-                return rgb(cache.irradiance(2 * patch.index + 1, patch.found))
+                return cache.rgb(2 * patch.index + 1, patch.found)
             case "irradiance_error":
                 return (dr.gather(mi.Float, cache.error, patch.index, patch.found),)
             case "cluster":

@@ -12,9 +12,10 @@ import mitsuba as mi
 from ..lookup.lookup import Lookup
 from ..system.fingerprint import SensorConstants
 from ..system.interrupt import memory, not_interrupted
-from ..system.jit import LANES_ALIKE, give_back, rgb
+from ..system.jit import LANES_ALIKE, give_back
 from ..system.progress import stage
 from ..system.recording import Recorder
+from ..system.spectrum import colour, rgb, wavelength_sample
 from ..transport.camera import CameraSample
 from ..transport.gathered import Gathered
 from ..transport.rules import PathRules
@@ -120,8 +121,9 @@ def plain_sums(
     all have, to the bit.
     """
 
-    def channels(film, found, weight):
-        return [*_plain(film, found, weight), *(weight * value for value in aovs(found))]
+    def channels(film, found, weight, wavelengths):
+        values = (weight * value for value in aovs(found))
+        return [*_plain(film, found, weight, wavelengths), *values]
 
     record, made = (_directly, channels) if n_aovs else (recorder, _plain)
     return _accumulate(sensor, sampler, spp, seed, shading, record, made, n_aovs, first, pixels)
@@ -183,6 +185,8 @@ def put_gathered(
 def _put(sensor: mi.Sensor, sums: Sums) -> None:
     """Put sums over the samples of each pixel to a film that is prepared for them."""
     film = sensor.film()
+    if has_bands(film):  # Its weight comes last.
+        sums.append(sums.pop(_n_shown(film) - 1))
     width, height = (int(n) for n in film.crop_size())
     picture = dr.empty(mi.Float, len(sums) * height * width)
     first = len(sums) * dr.arange(mi.UInt32, height * width)
@@ -192,14 +196,15 @@ def _put(sensor: mi.Sensor, sums: Sums) -> None:
     film.put_block(mi.ImageBlock(tensor, film.crop_offset()))
 
 
-def _plain(film, found, weight):
-    return _shown(film, found.radiance, found.valid, weight)
+def _plain(film, found, weight, wavelengths):
+    return _shown(film, found.radiance, found.valid, weight, wavelengths)
 
 
-def _apart(film, found, weight):
+def _apart(film, found, weight, wavelengths):
     apart = found.radiance - found.gathered.radiance
     aovs = (weight * value for value in found.aovs)
-    return [*_shown(film, apart, found.valid, weight), *aovs, *found.gathered.channels()]
+    shown = _shown(film, apart, found.valid, weight, wavelengths)
+    return [*shown, *aovs, *found.gathered.as_colours(wavelengths).channels()]
 
 
 def _directly(key, function, *inputs):
@@ -211,8 +216,10 @@ def _accumulate(
 ) -> Sums:
     """Sums over the samples of each pixel, row by row, of ``channels(film, found, weight)``."""
     film = sensor.film()
+    if has_bands(film):
+        film.prepare([])  # It has no channels before.
     n_pixels, width = n_pixels_of(film), dr.opaque(mi.UInt32, int(film.crop_size()[0]))
-    n_channels = len(_shown(film, mi.Spectrum(0), mi.Bool(True), mi.Float(1))) + n_further
+    n_channels = _n_shown(film) + n_further
     values = _Values(sensor, PixelFilter.of(film.rfilter()), width, shading, channels)
     with stage("Rendering"):
         if sampler is None:
@@ -220,7 +227,8 @@ def _accumulate(
             pixels = pixels or range(n_pixels)
             share = Share.of(pixels.start, seed, spp, first, parts)
             constants = SensorConstants(sensor)
-            record = _directly if constants.in_python else recorder
+            # What films with bands show of themselves, dr.freeze mixes up.
+            record = _directly if constants.in_python or has_bands(film) else recorder
             arguments = values, share, memory(), len(pixels), parts, n_channels
             # What film and sampler hold would be recorded too: as mi.render leaves them.
             film.prepare([])
@@ -314,7 +322,9 @@ def _lane_per_sample(values, n_pixels, spp, seed, n_channels, sampler):
 
 
 def _sample(sensor, pixel_filter, sampler, shade, position):
-    """The ``CameraSample`` of one sample of each pixel, weighted, and its weight in the pixel."""
+    """The ``CameraSample`` of one sample of each pixel, weighted, its weight in the pixel, and its
+    wavelengths.
+    """
     film = sensor.film()
     offset, filter_weight = pixel_filter.sample(sampler.next_2d())
     place = mi.Vector2f(position) + 0.5 + offset
@@ -323,9 +333,10 @@ def _sample(sensor, pixel_filter, sampler, shade, position):
     time = mi.Float(sensor.shutter_open())
     if sensor.shutter_open_time() > 0:
         time += sampler.next_1d() * sensor.shutter_open_time()
-    ray, weight = sensor.sample_ray_differential(time, 0, within, aperture)
+    which = wavelength_sample(sampler)
+    ray, weight = sensor.sample_ray_differential(time, which, within, aperture)
     found = shade(sampler, mi.Ray3f(ray))
-    return found.scaled(weight * filter_weight), filter_weight
+    return found.scaled(weight * filter_weight), filter_weight, ray.wavelengths
 
 
 def n_pixels_of(film: mi.Film) -> int:
@@ -333,8 +344,23 @@ def n_pixels_of(film: mi.Film) -> int:
     return int(film.crop_size()[0]) * int(film.crop_size()[1])
 
 
-def _shown(film: mi.Film, radiance, valid, weight) -> list[mi.Float]:
+def _shown(film: mi.Film, radiance, valid, weight, wavelengths) -> list[mi.Float]:
     """What every film holds: colour, alpha if wanted, and the weight of a sample."""
-    wanted = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
-    alpha = [dr.select(valid, weight, 0)] if wanted else []
-    return [*rgb(radiance), *alpha, weight]
+    if has_bands(film):
+        return film.prepare_sample(radiance, wavelengths, _n_shown(film), weight)
+    alpha = [dr.select(valid, weight, 0)] if _has_alpha(film) else []
+    return [*rgb(colour(radiance, wavelengths)), *alpha, weight]
+
+
+def _n_shown(film: mi.Film) -> int:
+    """Number of ``_shown``."""
+    return film.base_channels_count() + 1 if has_bands(film) else 4 + _has_alpha(film)
+
+
+def _has_alpha(film: mi.Film) -> bool:
+    return mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
+
+
+def has_bands(film: mi.Film) -> bool:
+    """Does it hold spectral bands in place of a colour?"""
+    return mi.has_flag(film.flags(), mi.FilmFlags.Special)

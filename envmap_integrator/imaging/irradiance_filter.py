@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..system.spectrum import colour_type
 from ..transport.gathered import Gathered
 
 #: Pixels on each side that may contribute. What is farther away adds cost but hardly less noise.
@@ -51,7 +52,7 @@ def tolerance(n_samples: int) -> float:
     return TOLERANCE * n_samples ** (-1 / 6)
 
 
-def filter_irradiance(records: mi.Float, width: int, allowed: float) -> mi.Spectrum:
+def filter_irradiance(records: mi.Float, width: int, allowed: float) -> mi.Spectrum | mi.Color3f:
     """The gathered radiance of every pixel, from the irradiance around it.
 
     ``records`` are those of an image of ``width`` pixels, row by row; ``allowed`` is the
@@ -70,7 +71,8 @@ def filter_irradiance(records: mi.Float, width: int, allowed: float) -> mi.Spect
     dr.eval(shared, kept)
     dr.scatter(records, shared, (_RECORD // 4) * pixel + 2)
     result = _average(records, width, sharpness, 1, _Record.whole, mi.Bool(True)) + kept
-    result = mi.Spectrum(*(result[c] for c in range(len(mi.Spectrum()))))
+    kind = colour_type()
+    result = kind(*(result[c] for c in range(len(kind()))))
     dr.eval(result)
     return result
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..lookup.cube import direction_to_face
 from ..lookup.cube_map import CubeMap
+from ..system.spectrum import as_rgb
 from .pictures import on_ramp, tone_mapped, white_of
 
 #: Texels along the edge of a face of the largest level that is shown.
@@ -80,7 +81,7 @@ def unfolded(cube_map: CubeMap, faces: Faces) -> tuple[np.ndarray, np.ndarray, f
     Returns also the nearest and the farthest distance: the ends of the colour scale.
     """
     levels = [level for level in cube_map.levels if level.shape[1] <= MOST_TEXELS]
-    radiance = cube_map.levels[0][..., :-1]
+    radiance = as_rgb(cube_map.levels[0][..., :-1])
     white = white_of(radiance.reshape(-1, 1, radiance.shape[-1]))
     inverse = np.abs(levels[0][..., -1])
     known = inverse[inverse > 1e-12]
@@ -88,7 +89,7 @@ def unfolded(cube_map: CubeMap, faces: Faces) -> tuple[np.ndarray, np.ndarray, f
     far = max(far, 1.01 * near)
     crosses = [faces.cross(level) for level in levels]
     return (
-        _side_by_side([(_coloured(c[..., :-1], white), covered) for c, covered in crosses]),
+        _side_by_side([(_coloured(as_rgb(c[..., :-1]), white), covered) for c, covered in crosses]),
         _side_by_side([(_distances(c[..., -1], near, far), covered) for c, covered in crosses]),
         float(near),
         float(far),

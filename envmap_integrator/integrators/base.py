@@ -19,6 +19,7 @@ from ..imaging.film import (
     Shading,
     Sums,
     gathered_sums,
+    has_bands,
     most_samples,
     n_pixels_of,
     plain_sums,
@@ -33,11 +34,11 @@ from ..preparation.baked_state import BakedState, Settings, StateKey, load
 from ..preparation.coarse_mesh.views import service, view_name
 from ..preparation.pipeline import prepare
 from ..preparation.scene_state import SceneState, SceneStates
-from ..system.checks import check_not_frozen, check_scene, check_variant
+from ..system.checks import check_film, check_not_frozen, check_scene, check_variant
 from ..system.interrupt import interruptible
-from ..system.jit import rgb
 from ..system.parameters import Parameters
 from ..system.recording import Recorder
+from ..system.spectrum import rgb, seen
 from ..transport.camera import CameraSample
 from ..transport.rules import PathRules, Residual
 
@@ -114,6 +115,10 @@ class CachedIntegrator(mi.SamplingIntegrator):
         """What there is to be in ``CameraSample.aovs``."""
         return ()
 
+    def check_sensor(self, sensor: mi.Sensor) -> None:
+        """Raise ``ValueError`` for a sensor that can't be rendered."""
+        check_film(sensor, self.owner)
+
     def sums(
         self,
         sensor: mi.Sensor,
@@ -179,6 +184,8 @@ class CachedIntegrator(mi.SamplingIntegrator):
             view = sensor
         else:
             view = sensors[sensor or 0] if sensors else None
+        if view:
+            self.check_sensor(view)
         name = view_name(view) if view else ""
         if view and name not in map(view_name, sensors):
             sensors.append(view)
@@ -468,15 +475,29 @@ class GatheringIntegrator(CachedIntegrator):
         )
 
     def sums(self, sensor, sampler, spp, seed, shading, recorder, first=0, pixels=None) -> Sums:
-        if not (self._shares() or self.indirect_aovs):
+        if not self._takes_apart(sensor):
             return super().sums(sensor, sampler, spp, seed, shading, recorder, first, pixels)
         return gathered_sums(sensor, sampler, spp, seed, shading, recorder, first, pixels)
 
     def put(self, sensor, sums, spp) -> None:
-        if not (self._shares() or self.indirect_aovs):
+        if not self._takes_apart(sensor):
             return super().put(sensor, sums, spp)
         n_shared = spp * self.secondary_samples if self._shares() else 0
         put_gathered(sensor, sums, n_shared, self._own_names(), self.indirect_aovs)
+
+    def check_sensor(self, sensor: mi.Sensor) -> None:
+        super().check_sensor(sensor)
+        if self.indirect_aovs and has_bands(sensor.film()):
+            raise ValueError(
+                f'{self.owner}: "indirect_aovs" are colours, and the film of sensor '
+                f'"{sensor.id()}" holds bands; leave them out, or take a hdrfilm'
+            )
+
+    def _takes_apart(self, sensor: mi.Sensor) -> bool:
+        """Is what surfaces gather wanted by itself, as a colour?"""
+        if has_bands(sensor.film()):
+            return False  # What pixels share is a colour.
+        return self._shares() or self.indirect_aovs
 
     def _shares(self) -> bool:
         """Do pixels share what they gather?"""
@@ -494,9 +515,9 @@ class GatheringIntegrator(CachedIntegrator):
     def aov_values(self, found: CameraSample) -> list[mi.Float]:
         if not self.indirect_aovs:
             return found.aovs
-        gathered = found.gathered
+        gathered, wavelengths = found.gathered, found.vertex.si.wavelengths
         indirect = (gathered.radiance, gathered.radiance, gathered.albedo)
-        return [*found.aovs, *(c for x in indirect for c in rgb(x))]
+        return [*found.aovs, *(c for x in indirect for c in rgb(seen(x, wavelengths)))]
 
 
 def _serves(state: BakedState, scene: mi.Scene, now: SceneState, view: mi.Sensor | None) -> bool:

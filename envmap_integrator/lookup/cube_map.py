@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..system.spectrum import BINS, bin_names
 from ..system.storage import Parts, Stored
 from .cube import n_levels
 
@@ -31,7 +32,7 @@ class Cluster:
 #: Texels along the edge of a face at most.
 MAX_RESOLUTION = 2048
 #: Names of the radiance channels, by their number.
-RADIANCE_CHANNELS = {1: ("Y",), 3: ("R", "G", "B")}
+RADIANCE_CHANNELS = {1: ("Y",), 3: ("R", "G", "B"), BINS: bin_names()}
 
 
 @dataclass(frozen=True)
@@ -39,9 +40,10 @@ class CubeMap:
     """The map of one cluster.
 
     cluster   what it is the map of
-    levels    [6, R_l, R_l, C + 1] per level, finest first: radiance [W/m²/sr], inverse distance
-              [1/m] from the cube's centre. Negative on the finest level where no ray from the
-              cluster was seen to arrive: what such texels hold is made up from their neighbours.
+    levels    [6, R_l, R_l, C + 1] per level, finest first: radiance [W/m²/sr] as the variant stores
+              it, inverse distance [1/m] from the cube's centre. Negative on the finest level where
+              no ray from the cluster was seen to arrive: what such texels hold is made up from
+              their neighbours.
     """
 
     cluster: Cluster

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..system.jit import upload
 from ..system.ray_counts import Ray, count
+from ..system.spectrum import padded, read_last, read_texel
 from .cube import direction_to_face, exit_distance, fold, n_texels, texel
 from .cube_map import CubeMap
 
@@ -42,8 +43,8 @@ class FarField:
 
     cubes              [M * 4]   centre and half width of each cube, world units
     texels             [T * (C + 1)]  radiance [W/m²/sr] by C channels and inverse distance [1/m]
-                                 from the centre, negative where masked; all maps, one after the
-                                 other, each laid out as in ``cube``
+                                 from the centre, negative where masked (``padded``); all maps, one
+                                 after the other, each laid out as in ``cube``
     layout             [M * 2]   face resolution R of the finest level and first texel of each map
     cluster_of_cell    cluster index of each large cell of the coarse mesh, M where there is none
     n_samples          [1]       samples that share a pixel: spp times secondary samples
@@ -149,9 +150,8 @@ class FarField:
         level_resolution = resolution >> level
         uv += (2 * u_texel - 1) / mi.Float(level_resolution)
         face, uv = fold(face, uv, 256 * u_texel.x - dr.floor(256 * u_texel.x))
-        value = self._fetch(layout, face, uv, level_resolution, active)
-        n_channels = len(mi.Spectrum())
-        return mi.Spectrum(*(value[i] for i in range(n_channels))), trusted
+        index = layout.y + texel(face, uv, layout.x, level_resolution)
+        return read_texel(self.texels, index, ray.wavelengths, active), trusted
 
     def intersect_emitters(
         self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool
@@ -171,11 +171,8 @@ class FarField:
 
     def _inverse_distance(self, layout, d, active):
         face, uv = direction_to_face(d)
-        return self._fetch(layout, face, uv, layout.x, active)[len(mi.Spectrum())]
-
-    def _fetch(self, layout, face, uv, level_resolution, active):
-        index = layout.y + texel(face, uv, layout.x, level_resolution)
-        return dr.gather(texel_type(), self.texels, index, active)
+        index = layout.y + texel(face, uv, layout.x, layout.x)
+        return read_last(self.texels, index, active)
 
 
 def far_field(
@@ -195,7 +192,7 @@ def far_field(
     first = np.cumsum([0, *map(n_texels, resolutions)])[:-1]
     return FarField(
         cubes=upload(mi.Float, np.array(cubes, dtype=np.float32)),
-        texels=upload(mi.Float, np.concatenate([cube_map.texels() for cube_map in maps])),
+        texels=upload(mi.Float, padded(np.concatenate([m.texels() for m in maps]))),
         layout=upload(mi.UInt32, np.stack([resolutions, first], axis=-1)),
         cluster_of_cell=upload(mi.UInt32, cluster_of_cell),
         n_clusters=dr.opaque(mi.UInt32, len(maps)),
@@ -220,8 +217,3 @@ def _emitter_scene(scene: mi.Scene) -> mi.Scene:
     for shape, id_ in zip(shapes, ids, strict=True):  # Loading has renamed them.
         shape.set_id(id_)
     return emitters
-
-
-def texel_type() -> type:
-    """Type of a packed texel: radiance and inverse distance."""
-    return {1: mi.Vector2f, 3: mi.Vector4f}[len(mi.Spectrum())]

@@ -17,6 +17,7 @@ from ..lookup.irradiance_cache import IrradianceCache
 from ..lookup.patches import BUCKET, Patches
 from ..system.fingerprint import difference
 from ..system.jit import opaque_point, upload
+from ..system.spectrum import n_stored
 from ..system.storage import StorageError, Stored, read, write
 from .coarse_mesh.views import Service
 from .maps.clusters import ClusterRequest
@@ -165,7 +166,7 @@ def save(path: str | os.PathLike, prepared: BakedState) -> None:
         "levels": dr.width(patches.levels),
         "patches": patches.count,
         "use_objects": patches.use_objects,
-        "channels": len(mi.Spectrum()),
+        "channels": n_stored(),
         "sources": dr.width(prepared.emitter_table),
         "emitter_rows": dr.width(prepared.emitter_rows),
         "views": list(prepared.views),
@@ -203,7 +204,7 @@ def _prepared(stored: Stored, key: StateKey, n_emitters: int) -> BakedState:
 
     n_cells = stored.integer("levels", BUCKET)
     n_patches = stored.integer("patches", BUCKET)
-    n_channels = len(mi.Spectrum())
+    n_channels = n_stored()
     patches = Patches(
         origin=opaque_point(stored.point("origin")),
         size=dr.opaque(mi.Float, stored.number("size")),
@@ -236,7 +237,7 @@ def _prepared(stored: Stored, key: StateKey, n_emitters: int) -> BakedState:
             raise stored.refusal(f"its clusters are more than its {len(maps)} maps")
     return BakedState(
         key,
-        IrradianceCache(patches, upload(mi.Float, table), upload(mi.Float, error)),
+        IrradianceCache.of(patches, upload(mi.Float, table), upload(mi.Float, error)),
         upload(mi.Float, sources),
         upload(mi.UInt32, rows),
         tuple(stored.texts("views")),

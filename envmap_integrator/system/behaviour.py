@@ -13,7 +13,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .jit import upload
+from .jit import R1, upload
+from .spectrum import wavelengths_at
 
 #: Number of places. Coordinates on surfaces lie inside the unit square in the first half of them.
 PLACES = 1024
@@ -134,4 +135,5 @@ def _interaction(rng: np.random.Generator) -> mi.SurfaceInteraction3f:
     si.n, si.sh_frame = mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Normal3f(0, 0, 1))
     si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
     si.wi = _directions(rng)
+    si.wavelengths = wavelengths_at(mi.Float(dr.arange(mi.UInt32, PLACES)) * R1)
     return si

@@ -7,7 +7,11 @@ import mitsuba as mi
 
 from .llvm import ensure_llvm
 
-SUPPORTED_VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "cuda_ad_rgb", "cuda_ad_mono")
+SUPPORTED_VARIANTS = tuple(
+    f"{backend}_ad_{colour}"
+    for backend in ("llvm", "cuda")
+    for colour in ("rgb", "mono", "spectral")
+)
 
 
 def check_variant(plugin: str) -> None:
@@ -71,6 +75,20 @@ def check_scene(scene: mi.Scene, owner: str) -> None:
                 f'{owner}: sensor "{sensor.id()}" lies in a participating medium, which isn\'t '
                 "supported; remove it or use volpath"
             )
+
+
+def check_film(sensor: mi.Sensor, owner: str) -> None:
+    """Raise ``ValueError`` for films with bands beyond the wavelengths that are stored."""
+    response = sensor.film().sensor_response_function()
+    if response is None:
+        return
+    shortest, longest = response.wavelength_range()
+    if shortest < mi.MI_CIE_MIN or longest > mi.MI_CIE_MAX:
+        raise ValueError(
+            f'{owner}: the film of sensor "{sensor.id()}" has bands from {shortest:g} nm to '
+            f"{longest:g} nm, light is known from {mi.MI_CIE_MIN:g} nm to {mi.MI_CIE_MAX:g} nm; "
+            "narrow the bands"
+        )
 
 
 def misplaced(emitter: mi.Emitter) -> str:

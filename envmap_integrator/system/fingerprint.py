@@ -12,6 +12,7 @@ import numpy as np
 from blake3 import blake3
 
 from .behaviour import behaviour
+from .spectrum import n_stored
 
 #: What the parts of a fingerprint stand for, in their order.
 PARTS = (
@@ -135,7 +136,7 @@ def _parts(content: SceneContent, digests: _Digests) -> Iterator[str]:
     def all_of(hashes):
         return _digest(*sorted(hashes)).hex()
 
-    yield f"{len(mi.Spectrum())}"
+    yield f"{n_stored()}"
     yield all_of(map(digests.own, content.shapes))
     # Whether shapes share a material or have two that are the same doesn't matter.
     yield all_of(set(map(digests.whole, content.of_kind(mi.BSDF))))

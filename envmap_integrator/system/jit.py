@@ -49,12 +49,8 @@ def mean_channel(colour: mi.Spectrum) -> mi.Float:
     return dr.sum(colour) / len(colour)
 
 
-def rgb(radiance: mi.Spectrum) -> tuple[mi.Float, mi.Float, mi.Float]:
-    """What films hold of a colour."""
-    return tuple(radiance) if len(radiance) == 3 else (radiance[0],) * 3
-
-
-#: Steps of the R2 sequence (Roberts 2018).
+#: Steps of the R1 and the R2 sequence (Roberts 2018).
+R1 = 0.6180339887498949
 R2 = (0.7548776662466927, 0.5698402909980532)
 
 

@@ -143,7 +143,7 @@ def split(
         arriving /= rules.secondary_samples
         wide /= rules.secondary_samples
         nearness /= rules.secondary_samples
-    gathered = gathering(scene, si, vertex.bsdf, wide, nearness, vertex.smooth)
+    gathered = gathering(scene, lookup, si, vertex.bsdf, wide, nearness, vertex.smooth)
     seen = CameraSample(radiance + arriving, distance, valid, gathered, vertex).scaled(throughput)
     return replace(seen, radiance=seen.radiance + on_mirrors)
 
@@ -187,6 +187,7 @@ def follow_mirrors(
 
 def gathering(
     scene: mi.Scene,
+    lookup: Lookup,
     si: mi.SurfaceInteraction3f,
     bsdf: mi.BSDFPtr,
     radiance: mi.Spectrum,
@@ -195,10 +196,13 @@ def gathering(
 ) -> Gathered:
     """What pixels may share of the ``radiance`` [W/m²/sr] that the wide lobes of a surface reflect.
 
-    ``nearness`` [1/m] is the inverse distance to where that comes from.
+    ``nearness`` [1/m] is the inverse distance to where that comes from. Colours of light at several
+    wavelengths are in proportion to the albedo at these only if it's weighted by the light's hue.
     """
     albedo = bsdf.eval_diffuse_reflectance(si, active)
     albedo += dr.select(single_lobe(bsdf), 0, GLOSS_ALBEDO)
+    if lookup.cache.hue is not None:
+        albedo *= lookup.cache.hue_at(si.wavelengths)
     shared = active & is_diffuse(bsdf) & (dr.max(albedo) > 0)
     centre = opaque_point(scene.bbox().center())
     found = Gathered(radiance, albedo, si.sh_frame.n, si.p - centre, nearness, mi.Float(1))

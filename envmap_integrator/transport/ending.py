@@ -121,5 +121,5 @@ def end_in_cache(
         # Later residuals count less by the albedo, and deserve as much less effort.
         less = dr.max(scattered.weight) / service.boost
         path.q[residual] = dr.clip(less, 0.1, 1)
-    irradiance = lookup.cache.irradiance(service.row, dr.any(weight != 0))
+    irradiance = lookup.cache.irradiance(service.row, vertex.si.wavelengths, dr.any(weight != 0))
     return weight * irradiance * dr.inv_pi, scattered, ends

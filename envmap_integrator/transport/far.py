@@ -73,7 +73,7 @@ def look_up_far(
     # ---------------------- Trace on ----------------------
 
     traced_on = left & (~trusted | estimates)
-    beyond = mi.Ray3f(ray(ray.maxt), ray.d)
+    beyond = mi.Ray3f(ray(ray.maxt), ray.d, wavelengths=ray.wavelengths)
     count(Ray.RETRACED, beyond, traced_on)
     further = scene.ray_intersect(beyond, traced_on)
     counts = path.active & (si.t <= path.reach) & ~left

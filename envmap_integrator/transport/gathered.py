@@ -7,21 +7,24 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from ..system.spectrum import colour, colour_type
+
 
 @dataclass
 class Gathered:
     """Indirect light that a surface seen by the camera has gathered, or sums of that.
 
     radiance   [W/m²/sr]  what its wide lobes reflect
-    albedo     [1]        what that is in proportion to, while irradiance is the same
+    albedo     [1]        what that is in proportion to, while irradiance is the same: where there
+                          are wavelengths, weighted by the hue of light
     normal     [3]        shading normal
     position   [3]        relative to a point near the scene, world units
     nearness   [1/m]      inverse distance of what the secondary ray hit
     weight     [1]        1 if there is such a surface, else all are zero
     """
 
-    radiance: mi.Spectrum
-    albedo: mi.Spectrum
+    radiance: mi.Spectrum | mi.Color3f
+    albedo: mi.Spectrum | mi.Color3f
     normal: mi.Vector3f
     position: mi.Vector3f
     nearness: mi.Float
@@ -46,10 +49,15 @@ class Gathered:
         values = (dr.select(mask, getattr(self, name), 0) for name in self.CHANNELS)
         return Gathered(*values)
 
+    def as_colours(self, wavelengths: mi.Color0f | mi.Spectrum) -> Gathered:
+        """The same with what adds up over samples of any wavelengths [nm]."""
+        radiance, albedo = (colour(x, wavelengths) for x in (self.radiance, self.albedo))
+        return replace(self, radiance=radiance, albedo=albedo)
+
     @classmethod
     def count(cls) -> int:
         """Number of channels."""
-        return 2 * len(mi.Spectrum()) + 8
+        return 2 * len(colour_type()()) + 8
 
     @classmethod
     def of_channels(cls, channels: list[mi.Float]) -> Gathered:
@@ -60,8 +68,8 @@ class Gathered:
             return kind(*(next(values) for _ in range(len(kind()))))
 
         return cls(
-            radiance=take(mi.Spectrum),
-            albedo=take(mi.Spectrum),
+            radiance=take(colour_type()),
+            albedo=take(colour_type()),
             normal=take(mi.Vector3f),
             position=take(mi.Vector3f),
             nearness=next(values),

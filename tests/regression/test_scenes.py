@@ -6,8 +6,10 @@ import subprocess
 import sys
 
 import mitsuba as mi
+import numpy as np
 import pytest
 
+from compare.gallery import DEFAULT_BIAS, SEEDS, relative_difference
 from tests.helpers import SCENES, assert_agree, exactly, load_scene, measure
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -69,3 +71,23 @@ def test_third_party_scenes(third_party_scene, name):
     path = third_party_scene(name)
     scene = mi.load_file(str(path), resx=WIDTH, resy=HEIGHT)
     assert_like_path(scene, OTHERS[name], spp=512, precision=0.05)
+
+
+def rendered(scene, integrator, spp: int, seed: int) -> np.ndarray:
+    return np.array(mi.render(scene, integrator=integrator, spp=spp, seed=seed))
+
+
+@pytest.mark.slow
+@pytest.mark.variants("llvm_ad_spectral")
+@pytest.mark.parametrize("name", ["paper_room", "desk", *OTHERS])
+def test_spectral(name, third_party_scene):
+    """Negative colours are possible there, of light that no screen can show."""
+    path = third_party_scene(name) if name in OTHERS else SCENES / f"{name}.xml"
+    scene = mi.load_file(str(path), resx=WIDTH, resy=HEIGHT)
+    kinds = (mi.load_dict({"type": "envmap_hybrid"}), 128), (mi.load_dict({"type": "path"}), 256)
+    ours, reference = (
+        np.stack([rendered(scene, one, spp, seed) for seed in range(SEEDS)]) for one, spp in kinds
+    )
+    assert np.isfinite(ours).all()
+    off, margin = relative_difference(ours[..., :3], reference[..., :3])
+    assert margin < 0.03 and abs(off) <= DEFAULT_BIAS + margin

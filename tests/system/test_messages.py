@@ -463,6 +463,31 @@ def without_dask(s: Surroundings) -> None:
     shell(commands.render, workers=2)(s)
 
 
+def on_bands(shortest: float, longest: float, **settings: object) -> Callable:
+    """Rendering with a band between two wavelengths [nm]."""
+
+    def action(_):
+        mi.set_variant("llvm_ad_spectral")
+        band = {"type": "spectrum", "value": [(shortest, 1.0), (longest, 1.0)]}
+        sensor = camera() | {"film": {"type": "specfilm", "width": 4, "height": 4, "band": band}}
+        picture = integrator("one_level_path", **settings)
+        picture.render(load(room(sensor=sensor)), spp=1)
+
+    return action
+
+
+def png_of_bands(s: Surroundings) -> None:
+    mi.set_variant("llvm_ad_spectral")
+    path = s.folder / "bands.xml"
+    path.write_text(
+        '<scene version="3.0.0"> <sensor type="perspective"> <film type="specfilm">'
+        '<spectrum name="band" value="500:1, 600:1"/> </film> </sensor>'
+        '<shape type="sphere"/> <emitter type="constant"/> </scene>'
+    )
+    options = {"scene": path, "output": s.folder / "bands.exr", "mode": "llvm_ad_spectral"}
+    commands.render(command_line(**options, png=True))
+
+
 AGAIN = "make it again with envmap-render bake"
 STATE = '"cache_file" {folder}/altered.exr'
 CASES = {
@@ -667,6 +692,14 @@ CASES = {
         shell(commands.render, integrator="envmap_hybrid", progressive=True, denoise=True),
         "--denoise", "one picture", "leave out --progressive, --time and --target-error",
     ),
+    "bands in the infrared": Case(
+        on_bands(700, 900), "one_level_path: the film", "700 nm to 900 nm", "narrow the bands"
+    ),
+    "bands and colours": Case(
+        on_bands(500, 600, indirect_aovs=True),
+        "one_level_path", '"indirect_aovs"', "take a hdrfilm",
+    ),
+    "a PNG of bands": Case(png_of_bands, "--png", "holds bands", "take a hdrfilm"),
     "no time": Case(
         shell(commands.render, integrator="envmap_hybrid", time=0.0), "--time", "0.0", "above 0"
     ),

@@ -13,7 +13,7 @@ SWITCH = """
 import envmap_integrator
 import mitsuba as mi
 from tests.helpers import assert_agree, integrator, load, measure, room
-for variant in ("llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"):
+for variant in ("llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral", "llvm_ad_rgb"):
     mi.set_variant(variant)
     scene = load(room())
     ours, path = (
@@ -54,7 +54,9 @@ def test_the_package_may_be_imported_after_the_variant_is_set():
     python(IMPORT_LATE)
 
 
-@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized"])
+@pytest.mark.parametrize(
+    "variant", ["scalar_rgb", "llvm_ad_spectral_polarized", "llvm_ad_mono_polarized"]
+)
 @pytest.mark.parametrize("plugin", ["envmap_hybrid", "one_level_path"])
 def test_other_variants_get_a_clear_error(variant, plugin):
     message = python(LOAD.format(variant=variant, plugin=plugin))

@@ -47,7 +47,7 @@ def test_supported_variants_pass(monkeypatch, name):
 
 
 @pytest.mark.parametrize(
-    "name", ["scalar_rgb", "llvm_ad_spectral", "llvm_ad_mono_polarized", "cuda_ad_spectral"]
+    "name", ["scalar_rgb", "llvm_ad_spectral_polarized", "llvm_ad_mono_polarized"]
 )
 def test_other_variants_are_refused(monkeypatch, name):
     monkeypatch.setattr(mi, "variant", lambda: name)
@@ -55,7 +55,7 @@ def test_other_variants_are_refused(monkeypatch, name):
         check_variant("envmap_hybrid")
 
 
-@pytest.mark.parametrize("name", ["scalar_rgb", "llvm_ad_spectral"])
+@pytest.mark.parametrize("name", ["scalar_rgb", "llvm_ad_spectral_polarized"])
 @pytest.mark.parametrize(
     "plugin",
     ["envmap_hybrid", "one_level_path", "source_selection", "envmap_bake", "mipmap_cube"],

@@ -15,6 +15,7 @@ from envmap_integrator.preparation.radiosity.gather import block_mean, gather
 from envmap_integrator.preparation.radiosity.incidence import Incidence
 from envmap_integrator.preparation.radiosity.irradiance import solve_irradiance
 from envmap_integrator.preparation.radiosity.noise import TARGET, Noise
+from envmap_integrator.preparation.radiosity.unknowns import Unknowns
 from tests.helpers import Description, at, box, camera, emitting, grey, load, room
 from tests.unit.kit import coarse_mesh
 
@@ -48,7 +49,7 @@ def solutions(scene: mi.Scene, more_rays: int = 0, count: int = 16, budget=BUDGE
     members = PatchPoints(coarse)
     patches = np.arange(len(members.patches))
     incidence = Incidence(coarse.points)
-    rays = gather(scene, lookup, members, incidence, patches, 1024, seed=7)
+    rays = gather(scene, lookup, Unknowns(members), incidence, patches, 1024, seed=7)
     seen = (coarse.points.seen > 0) & (coarse.points.bounce == 0) & (coarse.patch_of_point >= 0)
     share = np.bincount(coarse.patch_of_point[seen], minlength=coarse.patches.count)
     share = share[members.patches] / share.sum()
@@ -64,7 +65,7 @@ def solutions(scene: mi.Scene, more_rays: int = 0, count: int = 16, budget=BUDGE
             more_rays,
             seed=1 << 20 | seed << 12,
         )
-        arriving = rays.weight * solution.cache.irradiance(rays.row)
+        arriving = rays.weight * dr.gather(mi.Spectrum, solution.cache.table, rays.row)
         arriving = block_mean(dr.mean(arriving), rays.samples).numpy()
         brightness.append(share @ (own + arriving))
         stated.append(solution.noise.chance)

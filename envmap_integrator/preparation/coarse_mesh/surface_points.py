@@ -16,6 +16,7 @@ import numpy as np
 from ...lookup.ids import ObjectIds
 from ...system.jit import mean_channel, upload, upload_vectors
 from ...system.ray_counts import Ray, count
+from ...system.spectrum import random_wavelengths
 
 #: Hits followed along each global line, and along each walk from a sensor.
 LINE_HITS, WALK_HITS = 8, 4
@@ -295,7 +296,8 @@ def _global_lines(
     direction = mi.warp.square_to_uniform_sphere(sampler.next_2d())
     disk = mi.warp.square_to_uniform_disk_concentric(sampler.next_2d())
     offset = mi.Frame3f(direction).to_world(mi.Vector3f(disk.x, disk.y, -1.01))
-    return mi.Ray3f(mi.Point3f(sphere.xyz) + sphere.w * offset, direction), sphere
+    origin, wavelengths = mi.Point3f(sphere.xyz) + sphere.w * offset, random_wavelengths(sampler)
+    return mi.Ray3f(origin, direction, wavelengths=wavelengths), sphere
 
 
 @dr.syntax
@@ -369,7 +371,7 @@ def _hits_along(
             )
             direction = si.to_world(bs.wo)
             dr.scatter(reflects, mean_channel(weight), index, keep)
-            active &= mi.luminance(weight) > 0 if len(weight) == 3 else weight[0] > 0
+            active &= mi.luminance(weight) > 0 if mi.is_rgb else dr.max(weight) > 0
         ray = si.spawn_ray(direction)
         index += n_rays_
         active &= index < n_hits_ * n_rays_

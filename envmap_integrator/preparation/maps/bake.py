@@ -11,6 +11,7 @@ from ...lookup.cube_map import Cluster, CubeMap
 from ...system.jit import upload
 from ...system.progress import stage
 from ...system.ray_counts import Ray, count
+from ...system.spectrum import n_packets, n_stored, packet_wavelengths
 from ..coarse_mesh.surface_points import SurfacePoints
 from .mipmap import build_levels
 
@@ -35,7 +36,8 @@ def bake_maps(
     they hit; ``points`` are the surface points of each cluster. Rays go out from the centre but
     start on the cube. Where a start lies behind geometry, no ray of the cluster ever leaves there:
     such texels, recognised because no point of the cluster sees the start, are masked and filled
-    before mip-mapping. ``samples`` rays per texel, a power of two.
+    before mip-mapping. ``samples`` rays per texel, a power of two; packets of wavelengths share
+    them.
     """
     if not clusters:
         return ()
@@ -47,8 +49,11 @@ def bake_maps(
     resolution_ = dr.opaque(mi.UInt32, resolution)
     n_pixels = resolution_ * resolution_
 
+    packets = n_packets()
+    each = max(samples // packets, 1)
+    samples = packets * each
     launch = max(MAX_LANES // samples, 1)
-    totals = np.empty((n_texels, len(mi.Spectrum()) + 2), np.float32)
+    totals = np.empty((n_texels, n_stored() + 2), np.float32)
     with stage("Baking maps", total=n_texels) as advance:
         for begin in range(0, n_texels, launch):
             end = min(begin + launch, n_texels)
@@ -84,21 +89,41 @@ def bake_maps(
             count(Ray.SURVEY, ray, reached)
             reached &= ~scene.ray_test(ray, reached)
 
-            radiance, distance = radiance_distance(sampler, mi.Ray3f(o, d), reached)
+            within_bin = sampler.next_1d() if packets > 1 else 0
+            wavelengths = packet_wavelengths(lane // each % packets, within_bin)
+            ray = mi.Ray3f(o, d, wavelengths=wavelengths)
+            radiance, distance = radiance_distance(sampler, ray, reached)
             value = [*radiance, dr.rcp(start + distance)]
             value = [dr.select(reached & dr.isfinite(c), c, 0) for c in value]
             value.append(dr.select(reached, 1.0, 0.0))
             dr.eval(value)  # Once: each block sum would trace all rays anew.
-            total = [dr.block_sum(c, samples) for c in value]
+            total = [dr.block_sum(c, each) for c in value]
             dr.eval(total)
-            totals[begin:end] = np.stack([t.numpy() for t in total], axis=-1)
+            totals[begin:end] = _joined(np.stack([t.numpy() for t in total], axis=-1), packets)
             advance(end - begin)
 
     shape = 6, resolution, resolution, totals.shape[1]
     return tuple(
-        CubeMap(cluster, _levels(total.reshape(shape), samples))
+        CubeMap(cluster, _levels(total.reshape(shape), each))
         for cluster, total in zip(clusters, np.split(totals, len(clusters)), strict=True)
     )
+
+
+def _joined(total: np.ndarray, packets: int) -> np.ndarray:
+    """Sums [T, C + 2] of texels from those [T * packets, S + 2] of packets of S wavelengths each.
+
+    As if as many rays had arrived in each packet as in the one that has fewest: without any in one
+    of them, a texel isn't known.
+    """
+    if packets == 1:
+        return total
+    total = total.reshape(len(total) // packets, packets, -1)
+    arrived = total[..., -1:]
+    least = arrived.min(axis=1)
+    mean = total[..., :-2] / np.maximum(arrived, 1)
+    distance = total[..., -2].sum(axis=1) / np.maximum(arrived.sum(axis=(1, 2)), 1)
+    value = np.column_stack([mean.reshape(len(total), -1), distance])
+    return np.column_stack([value * least, least])
 
 
 def _levels(total: np.ndarray, samples: int) -> list[np.ndarray]:

@@ -12,6 +12,7 @@ from ...lookup.emitter_choice import EmitterChoice, Emitters
 from ...lookup.patches import normal_direction
 from ...system.jit import mean_channel, upload, upload_vectors
 from ...system.ray_counts import Ray, count
+from ...system.spectrum import random_wavelengths
 from ..coarse_mesh.build import cell_keys
 from ..coarse_mesh.mesh import CoarseMesh
 from ..coarse_mesh.patch_points import PatchPoints
@@ -60,6 +61,7 @@ def survey_direct_light(
     sampler.seed(seed, n)
     point = members.sample(dr.arange(mi.UInt32, n) // SAMPLES, sampler.next_1d())
     si = mesh.points.interaction(point)
+    si.wavelengths = random_wavelengths(sampler)
     choice = by_weight(emitters)
     ds, light = sample_irradiance(scene, choice, si, mi.UInt32(0), sampler.next_2d())
     irradiance = finite(mean_channel(light))

@@ -12,17 +12,19 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...lookup.irradiance_cache import packet_row
 from ...lookup.lookup import Lookup
 from ...lookup.patches import PARTS
-from ...system.jit import R2, mean_channel, mix, unit, upload
+from ...system.jit import R1, R2, mean_channel, mix, unit, upload
 from ...system.progress import stage
+from ...system.spectrum import packet_wavelengths
 from ...transport.direct_light import mis_weight
 from ...transport.path import follow
 from ...transport.rules import PathRules
 from ...transport.state import PathStart
-from ..coarse_mesh.patch_points import PatchPoints
 from .direct_light import finite, sample_irradiance
 from .incidence import Incidence
+from .unknowns import Unknowns
 
 #: Gather rays per kernel launch: bounds memory.
 MAX_LANES = 1 << 22
@@ -36,7 +38,7 @@ FLOATS_PER_RAY = 16
 class GatherRays:
     """What blocks of gather rays have found, ``samples`` N in each of B blocks.
 
-    rank             [B]      place in ``PatchPoints.patches`` of the patch a block belongs to
+    rank             [B]      place in ``Unknowns.patches`` of the unknown a block belongs to
     direct, escaped  [B]      W/m²: irradiance from emitters, and π b, the indirect light that comes
                               from no patch; means over the rays
     of_emitters, of_others [N * B]  W/m²: the same of each ray, mean of the colour channels
@@ -64,6 +66,17 @@ class GatherRays:
         """Rays N in a block."""
         return dr.width(self.row) // max(len(self), 1)
 
+    def of_patches(self, packets: int) -> GatherRays:
+        """The same by patches, whatever their packet."""
+        if packets == 1:
+            return self
+        row = 2 * ((self.row >> 1) // packets) + (self.row & 1)
+        start, place = (
+            PARTS * (x // PARTS // packets) + x % PARTS for x in (self.start, self.place)
+        )
+        dr.eval(row, start, place)
+        return replace(self, rank=self.rank // packets, row=row, start=start, place=place)
+
     @staticmethod
     def concatenate(parts: list[GatherRays]) -> GatherRays:
         """All blocks of several batches."""
@@ -74,21 +87,21 @@ class GatherRays:
 
 
 class Blocks:
-    """Which blocks of gather rays stand for each of K patches.
+    """Which blocks of gather rays stand for each of U unknowns, or of K patches.
 
-    rank    [B]  place of a block's patch, in ascending order
-    count   [K]  number of blocks
+    rank    [B]  place of a block's unknown, in ascending order
+    count   [U]  number of blocks
     """
 
-    def __init__(self, rank: np.ndarray, n_patches: int):
+    def __init__(self, rank: np.ndarray, n_unknowns: int):
         self.rank = rank
-        self.count = np.bincount(rank, minlength=n_patches)
-        self._one_each = len(rank) == n_patches
+        self.count = np.bincount(rank, minlength=n_unknowns)
+        self._one_each = len(rank) == n_unknowns
         self._first = upload(mi.UInt32, np.cumsum(self.count) - self.count)
         self._count = upload(mi.UInt32, self.count)
 
     def mean(self, values: mi.Spectrum) -> mi.Spectrum:
-        """Means [K] over the blocks of each patch, always summed in the same order."""
+        """Means [U] over the blocks of each unknown, always summed in the same order."""
         return values if self._one_each else self._mean(dr.ravel(values))
 
     @dr.syntax
@@ -104,13 +117,13 @@ class Blocks:
 def gather(
     scene: mi.Scene,
     lookup: Lookup,
-    members: PatchPoints,
+    unknowns: Unknowns,
     incidence: Incidence,
     rank: np.ndarray,
     samples: int,
     seed: int,
 ) -> GatherRays:
-    """Send a block of rays, ``samples`` of them, from surface points of each patch in ``rank``.
+    """Send a block of rays, ``samples`` of them, from surface points for each unknown in ``rank``.
 
     Rays start from random ones of the points, with as many shadow rays. ``samples`` must be a power
     of two.
@@ -121,7 +134,7 @@ def gather(
         for begin in range(0, len(rank), launch):
             some = rank[begin : begin + launch]
             seed_ = seed + 1 + begin
-            found.append(_gather(scene, lookup, members, incidence, some, samples, seed_))
+            found.append(_gather(scene, lookup, unknowns, incidence, some, samples, seed_))
             advance(len(some))
     return GatherRays.concatenate(found)
 
@@ -133,13 +146,16 @@ def block_mean(value: mi.Spectrum | mi.Float, samples: int) -> mi.Spectrum | mi.
     return type(value)(*(dr.block_sum(c, samples) / samples for c in value))
 
 
-def _gather(scene, lookup, members, incidence, rank, samples, seed) -> GatherRays:
+def _gather(scene, lookup, unknowns, incidence, rank, samples, seed) -> GatherRays:
+    members, packets = unknowns.members, unknowns.packets
     n_lanes = len(rank) * samples
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, n_lanes)
     lane = dr.arange(mi.UInt32, n_lanes)
     block = lane >> dr.opaque(mi.UInt32, int(np.log2(samples)))
-    member = dr.gather(mi.UInt32, upload(mi.UInt32, rank), block)
+    member, packet = dr.gather(mi.UInt32, upload(mi.UInt32, rank), block), mi.UInt32(0)
+    if packets > 1:
+        member, packet = member // packets, member % packets
     k = lane & (dr.opaque(mi.UInt32, samples) - 1)
     point = members.sample(member, sampler.next_1d())
     si = members.points.interaction(point)
@@ -151,6 +167,8 @@ def _gather(scene, lookup, members, incidence, rank, samples, seed) -> GatherRay
         mi.Float(k) / dr.opaque(mi.Float, samples), mi.radical_inverse_2(k, 0), block, seed
     )
     v = _rotated(mi.Float(k) * R2[0], mi.Float(k) * R2[1], block, ~seed & 0xFFFFFFFF)
+    within_bin = _rotated(mi.Float(k) * R1, 0, block, seed ^ 0x55555555).x
+    si.wavelengths = packet_wavelengths(packet, within_bin)
 
     # ---- Direction: cosine ----
     wo = mi.warp.square_to_cosine_hemisphere(u)
@@ -193,12 +211,21 @@ def _gather(scene, lookup, members, incidence, rank, samples, seed) -> GatherRay
     )
     of_emitters, of_others = mean_channel(direct), mean_channel(escaped)
     # Block sums evaluate what they sum up: without this, each of them would trace all rays anew.
-    dr.eval(direct, escaped, of_emitters, of_others, weight, end_.row, end_.place, start_place)
+    row = packet_row(end_.row, packet)
+    start_place, place = (_packet_place(x, packet, packets) for x in (start_place, end_.place))
+    dr.eval(direct, escaped, of_emitters, of_others, weight, row, place, start_place)
     direct, escaped = block_mean(direct, samples), block_mean(escaped, samples)
     dr.eval(direct, escaped, weight)
     return GatherRays(
-        rank, direct, escaped, of_emitters, of_others, weight, end_.row, start_place, end_.place
+        rank, direct, escaped, of_emitters, of_others, weight, row, start_place, place
     )
+
+
+def _packet_place(place: mi.UInt32, packet: mi.UInt32, packets: int) -> mi.UInt32:
+    """``PathEnd.place`` on the patch that stands for one of several packets."""
+    if packets == 1:
+        return place
+    return PARTS * (packets * (place // PARTS) + packet) + place % PARTS
 
 
 def without_growth(
@@ -209,7 +236,7 @@ def without_growth(
     No patch receives more than what the others reflect, unless by noise: few rays met heavy weights
     of a material. In a room that averages out; in a narrow vase, which sees itself, the solution
     would grow without end. There, blocks that bring more than all light get as much as all blocks
-    do on average. ``patch`` [K] are those of the blocks, of ``n_patches``.
+    do on average. ``patch`` [U] are those of the unknowns, of ``n_patches``.
     """
     whole = dr.max(block_mean(rays.weight, rays.samples))
     dr.eval(whole)

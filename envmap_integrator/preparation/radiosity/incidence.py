@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...system.jit import R2, mean_channel, upload
+from ...system.spectrum import wavelengths_at
 from ...transport.lobes import Scattered, is_diffuse, single_lobe, wide_share
 from ..coarse_mesh.surface_points import SurfacePoints
 
@@ -67,7 +68,7 @@ def _reflected(materials: np.ndarray) -> np.ndarray:
     si = dr.zeros(mi.SurfaceInteraction3f, len(materials) * STEPS * samples)
     si.n, si.sh_frame = mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Normal3f(0, 0, 1))
     si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
-    si.uv = mi.Point2f(v, u)
+    si.uv, si.wavelengths = mi.Point2f(v, u), wavelengths_at(u)
     side = dr.select(material % 2 == 0, mi.Float(1), -1)
     si.wi = mi.Vector3f(sine * dr.cos(azimuth), sine * dr.sin(azimuth), side * cosine)
 

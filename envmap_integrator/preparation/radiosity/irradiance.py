@@ -6,7 +6,7 @@ tracing another ray. Where the picture hangs on few rays that found light, more 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -22,6 +22,7 @@ from ..coarse_mesh.patch_points import PatchPoints
 from .gather import FLOATS_PER_RAY, Blocks, GatherRays, block_mean, gather, without_growth
 from .incidence import Incidence
 from .noise import Noise, cache_noise
+from .unknowns import Unknowns
 
 #: Relative change of the irradiance at which the solution counts as converged, on the mean of all
 #: patches: each by its own irradiance, as the sunlit outside of a house says nothing of its rooms.
@@ -67,32 +68,33 @@ def solve_irradiance(
     """Gather and solve for the irradiance of every patch.
 
     ``samples`` rays start from each patch, a power of two, and up to about ``more_rays`` where the
-    picture's error hangs on them. If patches turn out to be too large, and ``may_divide``, it ends
-    there. With E_d the direct and E_i the indirect irradiance,
-    b the light that gather rays find outside the patches, and w the throughput with which they
-    end in patch j, the solution fulfils E_i = mean(π b + w E(j)), where E(j) is E_d + E_i or E_i.
+    picture's error hangs on them; packets of wavelengths share them. If patches turn out to be too
+    large, and ``may_divide``, it ends there. With E_d the direct and E_i the indirect irradiance, b
+    the light that gather rays find outside the patches, and w the throughput with which they end in
+    patch j, the solution fulfils E_i = mean(π b + w E(j)), where E(j) is E_d + E_i or E_i.
     """
-    n_patches = mesh.patches.count
-    members = PatchPoints(mesh)
-    n_channels, n_used = len(mi.Spectrum()), len(members.patches)
+    unknowns = Unknowns(PatchPoints(mesh))
+    samples = max(samples // unknowns.packets, 1)
+    n_patches = unknowns.packets * mesh.patches.count
+    n_channels, n_used = len(mi.Spectrum()), len(unknowns)
     if n_used == 0:  # Nothing but mirrors and glass.
         table = dr.zeros(mi.Float, 2 * n_patches * n_channels)
         no_cell = np.zeros(dr.width(lookup.patches.levels), dtype=bool)
-        cache = IrradianceCache(lookup.patches, table, dr.zeros(mi.Float, n_patches))
-        return Solution(cache, None, np.zeros(n_patches), no_cell)
+        cache = IrradianceCache.of(lookup.patches, table, dr.zeros(mi.Float, mesh.patches.count))
+        return Solution(cache, None, np.zeros(mesh.patches.count), no_cell)
 
     incidence = Incidence(mesh.points)
 
     def send(rank, seed):
-        return gather(scene, lookup, members, incidence, rank, samples, seed)
+        return gather(scene, lookup, unknowns, incidence, rank, samples, seed)
 
     rank = np.arange(n_used)
     for further in range(len(MORE) + 1):
         rays = send(rank, seed + further * SEED_STEP)
         blocks = Blocks(rank, n_used)
-        rays = without_growth(rays, blocks, members.patches, n_patches)
-        cache = IrradianceCache(lookup.patches, _solve(n_patches, members.patches, rays, blocks))
-        noise = cache_noise(rays, blocks, cache, members)
+        rays = without_growth(rays, blocks, unknowns.patches, n_patches)
+        cache = IrradianceCache(lookup.patches, _solve(n_patches, unknowns.patches, rays, blocks))
+        noise = cache_noise(rays, blocks, cache, unknowns)
         steep = noise.steep & (may_divide and further < len(MORE))
         if further == len(MORE) or steep.any():
             break
@@ -102,10 +104,11 @@ def solve_irradiance(
         if not wanted.any():
             break
         rank = np.repeat(np.arange(n_used), wanted)
-    escaped_share, error = np.zeros(n_patches), np.zeros(n_patches)
-    escaped_share[members.patches] = noise.escaped_share
-    error[members.patches] = noise.of_irradiance
-    cache = replace(cache, error=upload(mi.Float, error))
+    patches, (escaped_share, error) = unknowns.members.patches, np.zeros((2, mesh.patches.count))
+    escaped_share[patches] = unknowns.by_patch(noise.escaped_share).mean(axis=1)
+    of_packets = unknowns.by_patch(noise.of_irradiance)
+    error[patches] = np.sqrt(np.square(of_packets).sum(axis=1)) / unknowns.packets  # Of their mean.
+    cache = IrradianceCache.of(lookup.patches, cache.table, upload(mi.Float, error))
     n_rays = dr.width(rays.row)
     del rays
     give_back(FLOATS_PER_RAY * n_rays)

@@ -20,6 +20,7 @@ from ...system.jit import mean_channel
 from ..coarse_mesh.patch_points import PatchPoints
 from .coarseness import Coarseness, coarseness
 from .gather import Blocks, GatherRays
+from .unknowns import Unknowns
 
 #: Relative standard error of the picture's brightness that is good enough: two of them are 1 %.
 TARGET = 0.005
@@ -37,13 +38,13 @@ class Noise:
     chance           [1]  standard error of a picture's brightness, over that brightness: of the
                           sensor for which it is largest
     coarseness            what the size of the patches adds to it
-    scatter          [K]  what a single ray of each patch adds to that error, root mean square over
-                          the patch's surroundings
-    stake            [K]  share of the picture's brightness that passes through the patch, likewise
-    of_irradiance    [K]  W/m²: standard error of each patch's irradiance, by the chance of its rays
-                          alone, not of what they find on other patches
-    count            [K]  blocks of rays so far
-    escaped_share    [K]  see ``Solution``
+    scatter          [U]  what a single ray of each unknown adds to that error, root mean square
+                          over its patch's surroundings
+    stake            [U]  share of the picture's brightness that passes through it, likewise
+    of_irradiance    [U]  W/m²: its standard error, by the chance of its rays alone, not of what
+                          they find on other patches
+    count            [U]  blocks of rays so far
+    escaped_share    [U]  see ``Solution``
     """
 
     chance: float
@@ -66,7 +67,7 @@ class Noise:
         return coarse.steep & (abs(coarse.steep_bias) > max(TARGET, coarse.doubt))
 
     def blocks_wanted(self, most: int, samples: int) -> np.ndarray:
-        """How many new blocks [K] of ``samples`` rays each patch should have, ``most`` in all.
+        """How many new blocks [U] of ``samples`` rays each unknown should have, ``most`` in all.
 
         As many as bring the error to ``TARGET``, each where it lowers it most: in proportion to
         what a ray adds to the error (Neyman 1934). A few go by what is at stake, as patches whose
@@ -85,19 +86,28 @@ def cache_noise(
     rays: GatherRays,
     blocks: Blocks,
     cache: IrradianceCache,
-    members: PatchPoints,
+    unknowns: Unknowns,
 ) -> Noise:
     """Find out how uncertain a cache is that was solved from ``blocks`` of ``rays``."""
-    samples, rank = rays.samples, blocks.rank
+    samples, rank, packets = rays.samples, blocks.rank, unknowns.packets
     table = cache.mean_channel()
-    irradiance = table[2 * members.patches]
-    views = _views(members, irradiance)
-    total, indirect = _importance(rays, blocks, members, views)
-    of_patches = mean_channel(rays.weight * cache.irradiance(rays.row))
+    irradiance = table[2 * unknowns.patches]
+    # A patch's packets share its light.
+    views = _views(unknowns.members, unknowns.by_patch(irradiance).mean(axis=1))
+    views = np.repeat(views / packets, packets, axis=0)
+    total, indirect = _importance(rays, blocks, unknowns, views)
+    of_patches = mean_channel(rays.weight * dr.gather(mi.Spectrum, cache.table, rays.row))
     dr.eval(of_patches)
     # What is seen first gathers by rays of its own, as if it were patches.
-    importance = (indirect + views).sum(axis=1)
-    coarse = coarseness(rays, blocks, table, of_patches, importance, members)
+    importance = unknowns.by_patch((indirect + views).sum(axis=1)).sum(axis=1)
+    coarse = coarseness(
+        rays.of_patches(packets),
+        Blocks(rank // packets, len(importance)),
+        table.reshape(-1, packets, 2).mean(axis=1).ravel(),
+        of_patches,
+        importance,
+        unknowns.members,
+    )
 
     # ---- Scatter within each block: rays k and k ^ step start in neighbouring directions ----
     step = 1 << (samples.bit_length() - 1) // 2
@@ -129,7 +139,7 @@ def cache_noise(
     variance = variance.sum(axis=1)
 
     # ---- In its surroundings ----
-    cell = np.unique(members.cells, return_inverse=True)[1]
+    cell = np.unique(unknowns.cells, return_inverse=True)[1]
 
     def around(values):
         return (np.bincount(cell, values) / np.bincount(cell))[cell]
@@ -168,13 +178,13 @@ def _views(members: PatchPoints, irradiance: np.ndarray) -> np.ndarray:
     return np.column_stack(views) if views else np.zeros((n_patches, 1))
 
 
-def _importance(rays, blocks, members, views) -> tuple[np.ndarray, np.ndarray]:
-    """By how much each picture changes with a patch's direct and indirect irradiance [K, S].
+def _importance(rays, blocks, unknowns, views) -> tuple[np.ndarray, np.ndarray]:
+    """By how much each picture changes with direct and indirect irradiance [U, S].
 
     A picture sends secondary rays of its own from what it sees first; they end where the gather
     rays from there do. From patch to patch, importance flows against the light.
     """
-    samples, n_patches = rays.samples, len(members.patches)
+    samples, n_patches = rays.samples, len(unknowns)
     some = _spread(samples, min(samples, ADJOINT_RAYS))
     weight, row = (
         x.numpy().reshape(-1, samples)[:, some] for x in (mean_channel(rays.weight), rays.row)
@@ -182,7 +192,7 @@ def _importance(rays, blocks, members, views) -> tuple[np.ndarray, np.ndarray]:
     rank = blocks.rank[:, None]
     weight = weight / (weight.shape[1] * blocks.count[rank])
     place = (
-        (2 * members.rank_of_patch[row >> 1] + (row & 1)).ravel(),
+        (2 * unknowns.rank_of_patch[row >> 1] + (row & 1)).ravel(),
         np.broadcast_to(rank, row.shape).ravel(),
     )
     flow = csr_matrix((weight.ravel(), place), (2 * n_patches + 2, n_patches))
