@@ -16,7 +16,7 @@ from ..lookup.cube_map import Cluster
 from ..lookup.ids import ObjectIds
 from ..lookup.patches import DROPPED, MARK_BITS, UNEVEN
 from ..preparation.baked_state import BakedState
-from ..system.scene_order import ordered_shapes
+from ..system.scene_order import lasting_ids, ordered_shapes
 from ..system.warned import warned
 
 #: Samples per pixel of the picture, in two passes, and of the AOVs.
@@ -159,17 +159,18 @@ def _clusters(scene, sensor, state: BakedState, served: np.ndarray) -> list[Clus
     cluster = state.cluster_of_cell[cell.index.numpy()]
     cluster = np.where(cell.found.numpy(), cluster, len(state.maps))
     shapes, object_id = ordered_shapes(scene), object_id.numpy()
+    names = {its: shape.id() for its, shape in zip(lasting_ids(shapes), shapes, strict=True)}
     served = served.reshape(-1, 3)
     found = []
     for index, cube_map in enumerate(state.maps):
         there = cluster == index
-        count = np.bincount(object_id[there], minlength=len(shapes)) / len(there)
-        ranked = [i for i in np.argsort(-count, kind="stable") if count[i] > 0]
+        ids, count = np.unique(object_id[there], return_counts=True)
+        ranked = np.argsort(-count, kind="stable")
         found.append(
             ClusterView(
                 cube_map.cluster,
                 cube_map.masked,
-                {shapes[i].id(): float(count[i]) for i in ranked},
+                {names[ids[i]]: float(count[i] / len(there)) for i in ranked},
                 float(there.mean()),
                 tuple(served[there].mean(axis=0).tolist()) if there.any() else (0.0, 0.0, 0.0),
             )
