@@ -160,6 +160,15 @@ def use(make: Callable[[Surroundings], Path]) -> Callable:
     )
 
 
+def rebake(name: str, make: Callable[[Surroundings], Path]) -> Callable:
+    """Bake one map anew in the file that ``make`` leaves."""
+    return lambda s: integrator("envmap_hybrid", **SETTINGS).rebake(load(room()), make(s), [name])
+
+
+def brighter(parts: dict, metadata: dict) -> None:
+    parts["irradiance"]["Y"] = 2 * parts["irradiance"]["Y"]
+
+
 def seen_from_elsewhere(s: Surroundings) -> None:
     """From beneath the floor, where no sensor of the scene has been."""
     below = mi.load_dict(camera(origin=(0, -1.8, -5), target=(0, 0.5, -9)))
@@ -261,6 +270,7 @@ def command_line(**options: object) -> argparse.Namespace:
     defaults = {"mode": "llvm_ad_rgb", "threads": None, "define": [], "set": [], "debug": False}
     defaults |= {"integrator": None, "sensor": 0, "spp": 1, "seed": 0, "png": False}
     defaults |= {"progressive": False, "time": None, "target_error": None, "resume": False}
+    defaults |= {"clusters": None}
     defaults |= {"quiet": True, "json": False, "workers": None, "cluster": None, "tls": None}
     return argparse.Namespace(**defaults | {"denoise": False} | options)
 
@@ -540,6 +550,14 @@ CASES = {
         seen_from_elsewhere, '"cache_file" {folder}/state.exr', "other views", AGAIN
     ),
     "another scene": Case(use(altered(setting("scene", "a"))), STATE, "another scene", AGAIN),
+    "no such cluster": Case(
+        rebake("chair", lambda s: s.state),
+        "{state}", 'no cluster "chair", but desk', "name one of them",
+    ),
+    "another cache": Case(
+        rebake("desk", altered(brighter)), "altered.exr", "another irradiance cache",
+        "bake it whole",
+    ),
     "sources": Case(
         use(altered(wrong_rows)), STATE, "rows for 1 emitters", AGAIN
     ),
@@ -682,6 +700,10 @@ CASES = {
     "workers and progress": Case(
         shell(commands.render, integrator="envmap_hybrid", workers=2, time=1.0),
         "--workers", "one picture", "leave out --progressive, --time and --target-error",
+    ),
+    "no clusters": Case(
+        shell(commands.bake, integrator="one_level_path", clusters="desk"),
+        "--clusters", '"one_level_path" has none', "pass --integrator envmap_hybrid",
     ),
     "nothing to bake": Case(
         shell(commands.bake), "integrator", '"path"', "pass --integrator envmap_hybrid"
