@@ -90,6 +90,10 @@ BAKE_EXAMPLES = """examples:
   envmap-render bake room.xml --integrator envmap_hybrid -o state.exr \\
       --set maps=always --set no_cluster="lamp, curtain"
 
+  # One of them finer, in the file that there is: all other settings as before.
+  envmap-render bake room.xml --integrator envmap_hybrid -o state.exr \\
+      --set desk.shapes="table, ball" --set desk.resolution=256 --clusters desk
+
 """
 EXPORT_EXAMPLES = """examples:
   envmap-render export state.exr --map desk -o desk.exr        # for mipmap_cube and other tools
@@ -168,6 +172,12 @@ def build_parser() -> argparse.ArgumentParser:
     )
     _add_scene_options(bake)
     bake.add_argument("-o", "--output", type=Path, required=True)
+    bake.add_argument(
+        "--clusters",
+        metavar="NAME,…",
+        help="bake the maps of these clusters in OUTPUT anew, by their settings now, and leave all "
+        "else in it as it is",
+    )
     bake.set_defaults(command=commands.bake)
 
     inspect = subparsers.add_parser(

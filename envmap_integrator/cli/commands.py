@@ -194,7 +194,7 @@ INSPECTED = ("envmap_hybrid", "one_level_path")
 
 
 def bake(args: argparse.Namespace) -> int:
-    """Run the integrator's pre-passes alone and save their result."""
+    """Run the integrator's pre-passes alone and save their result, or bake some maps of it anew."""
     check_output(args.output)
     _configure_machine(args)
     seconds: dict[str, float] = {}
@@ -205,7 +205,15 @@ def bake(args: argparse.Namespace) -> int:
             hasattr(scene.integrator(), "prepare"),
             f'integrator "{name}" has nothing to bake: pass --integrator envmap_hybrid',
         )
-        state = scene.integrator().prepare(scene)
+        if args.clusters is None:
+            state = scene.integrator().prepare(scene)
+        else:
+            _require(
+                hasattr(scene.integrator(), "rebake"),
+                f'--clusters: integrator "{name}" has none; pass --integrator envmap_hybrid',
+            )
+            names = [each.strip() for each in args.clusters.split(",")]
+            state = scene.integrator().rebake(scene, args.output, names)
         seconds |= state.stage_times
         compilation = compilation_time()
     state.save(args.output)

@@ -17,7 +17,7 @@ from ..lookup.ids import ObjectIds
 from ..lookup.patches import DROPPED, MARK_BITS, UNEVEN
 from ..preparation.baked_state import BakedState
 from ..system.ray_counts import count_rays
-from ..system.scene_order import ordered_shapes
+from ..system.scene_order import lasting_ids, ordered_shapes
 from ..system.warned import warned
 
 #: Samples per pixel of the picture, in two passes, and of the AOVs.
@@ -173,18 +173,16 @@ def _clusters(scene, sensor, state: BakedState, served, near) -> list[ClusterVie
     ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, place, mi.Point2f(0.5))
     cluster, object_id = _hit(scene, state, mi.Ray3f(ray))
     shapes = ordered_shapes(scene)
+    names = {its: shape.id() for its, shape in zip(lasting_ids(shapes), shapes, strict=True)}
     served, near = served.reshape(-1, 3), near.ravel()
     found = []
     for index, cube_map in enumerate(state.maps):
         there = cluster == index
-        count = np.bincount(object_id[there], minlength=len(shapes)) / len(there)
-        ranked = [i for i in np.argsort(-count, kind="stable") if count[i] > 0]
-        ids = {shapes[i].id(): float(count[i]) for i in ranked}
-        if not ranked:
+        seen = _ranked(object_id[there])
+        ids = {names[its]: count / len(there) for its, count in seen.items()}
+        if not seen:
             its, hit = _hit(scene, state, _rays_at(cube_map.cluster))
-            most = np.bincount(hit[its == index], minlength=len(shapes))
-            ranked = [i for i in np.argsort(-most, kind="stable") if most[i] > 0]
-            ids = {shapes[i].id(): 0.0 for i in ranked}
+            ids = dict.fromkeys((names[i] for i in _ranked(hit[its == index])), 0.0)
         found.append(
             ClusterView(
                 cube_map.cluster,
@@ -216,3 +214,10 @@ def _rays_at(cluster: Cluster) -> mi.Ray3f:
     direction = (end - begin) / np.maximum(np.linalg.norm(end - begin, axis=1, keepdims=True), 1e-9)
     origin, direction = (mi.Point3f(x.T.astype(np.float32)) for x in (begin, direction))
     return mi.Ray3f(origin, mi.Vector3f(direction))
+
+
+def _ranked(ids: np.ndarray) -> dict[int, int]:
+    """How often each id comes, the most frequent first."""
+    each, count = np.unique(ids, return_counts=True)
+    order = np.argsort(-count, kind="stable")
+    return {int(each[i]): int(count[i]) for i in order}

@@ -190,7 +190,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
         if view and name not in map(view_name, sensors):
             sensors.append(view)
         if not self.cache_file:
-            settings = settings.for_render(_camera_samples(view, spp))
+            settings = settings.for_render(camera_samples(view, spp))
         if (settings, name) not in self._prepared:
             state = self._that_serves(scene, now, settings, view)
             if state is None:
@@ -220,7 +220,8 @@ class CachedIntegrator(mi.SamplingIntegrator):
 
     def _make(self, scene, now, key, settings, sensors) -> BakedState:
         if self.cache_file:
-            state = load(self.cache_file, key, self.owner, len(scene.emitters()))
+            owner = f'{self.owner}: "cache_file"'
+            state = load(self.cache_file, key, owner, len(scene.emitters()))
         else:
             with interruptible(), dr.suspend_grad():
                 state = prepare(scene, now, key.settings, settings, sensors, self.owner)
@@ -528,7 +529,7 @@ def _serves(state: BakedState, scene: mi.Scene, now: SceneState, view: mi.Sensor
     return found.suffices(state.service)
 
 
-def _camera_samples(sensor: mi.Sensor | None, spp: int) -> int:
+def camera_samples(sensor: mi.Sensor | None, spp: int) -> int:
     """Number of samples of a render of a sensor, if there is one."""
     if sensor is None:
         return 0

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Collection
 from dataclasses import replace
 
+import drjit as dr
 import mitsuba as mi
 
 from ..emitters.mipmap_cube import MipmapCube
 from ..lookup.cube_map import MAX_RESOLUTION
 from ..lookup.far_field import FarField
-from ..preparation.baked_state import BakedState, Settings
+from ..preparation.baked_state import BakedState, Settings, StateKey, load
+from ..preparation.pipeline import prepare
 from ..preparation.scene_state import SceneState
+from ..system.checks import check_scene
+from ..system.interrupt import interruptible
 from ..system.parameters import Parameters
 from ..transport.rules import PathRules
-from .base import GatheringIntegrator
+from .base import GatheringIntegrator, camera_samples
 from .envmap_bake import EnvmapBake
 
 
@@ -186,6 +192,41 @@ class EnvmapHybrid(GatheringIntegrator):
             requests=self.requests,
             no_cluster=self.no_cluster,
         )
+
+    def rebake(
+        self, scene: mi.Scene, path: str | os.PathLike, clusters: Collection[str]
+    ) -> BakedState:
+        """The state in a file, with the maps of some of its clusters baked anew.
+
+        The file is one of ``envmap-render bake`` or of ``prepare(scene).save``, for this scene and
+        these settings but those of the ``clusters``. What comes out is what baking everything would
+        make; the other maps and the irradiance cache are those of the file, to the bit.
+
+        Raises ``ValueError`` for a cluster that isn't in the file, and for a file that is missing,
+        damaged, or of another scene, other settings or another kind of machine.
+        """
+        check_scene(scene, self.owner)
+        now, asked = self._scenes(scene), self.settings()
+        key = StateKey(now.fingerprint, asked)
+        old = load(path, key, f"{self.owner}:", len(scene.emitters()), but=clusters)
+        names = [cube_map.cluster.name for cube_map in old.maps]
+        for name in clusters:
+            if name not in names:
+                there = ", ".join(names) or "none"
+                raise ValueError(
+                    f'{self.owner}: {path} has no cluster "{name}", but {there}; name one of them, '
+                    "or bake it whole"
+                )
+        kept = tuple(m for m in old.maps if m.cluster.name not in clusters)
+        settings = asked.for_render(camera_samples(next(iter(scene.sensors()), None), 0))
+        with interruptible(), dr.suspend_grad():
+            new = prepare(scene, now, asked, settings, scene.sensors(), self.owner, kept)
+        if not old.cache.same_as(new.cache):
+            raise ValueError(
+                f"{self.owner}: {path} has another irradiance cache than is made here, by another "
+                "kind of machine or for another number of samples; bake it whole"
+            )
+        return new
 
     def rules(self, seed: int) -> PathRules:
         return replace(

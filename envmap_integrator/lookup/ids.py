@@ -1,4 +1,4 @@
-"""Dense ids of the shapes of a scene, for kernels."""
+"""Ids of the shapes of a scene, for kernels."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ import mitsuba as mi
 import numpy as np
 
 from ..system.jit import upload
-from ..system.scene_order import ordered_shapes
+from ..system.scene_order import lasting_ids, ordered_shapes
 
 
 @dataclass(frozen=True)
 class ObjectIds:
-    """Dense index of the top-level shape under an interaction, as ``ordered_shapes`` counts them.
+    """Id of the top-level shape under an interaction: see ``lasting_ids``.
 
     Dr.Jit's own registry ids are global to the process and change from run to run; these don't,
     so what is stored by object id can be saved.
 
     count   number of shapes
-    table   index of each of Dr.Jit's ids
+    table   id of each of Dr.Jit's ids
     """
 
     count: int
@@ -29,11 +29,11 @@ class ObjectIds:
     @classmethod
     def of(cls, scene: mi.Scene) -> ObjectIds:
         """Those of the shapes of a scene."""
-        shapes = mi.ShapePtr(ordered_shapes(scene))
-        registry_ids = dr.reinterpret_array(mi.UInt32, shapes).numpy()
+        shapes = ordered_shapes(scene)
+        registry_ids = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shapes)).numpy()
         table = np.zeros(int(registry_ids.max(initial=0)) + 1, dtype=np.uint32)
-        table[registry_ids] = np.arange(len(registry_ids), dtype=np.uint32)
-        return cls(len(registry_ids), upload(mi.UInt32, table))
+        table[registry_ids] = lasting_ids(shapes)
+        return cls(len(shapes), upload(mi.UInt32, table))
 
     def __call__(self, si: mi.SurfaceInteraction3f) -> mi.UInt32:
         shape = dr.reinterpret_array(mi.UInt32, si.shape)

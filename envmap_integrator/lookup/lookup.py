@@ -16,7 +16,7 @@ class Lookup:
     """What kernels read of a scene besides the scene itself.
 
     patches      the coarse mesh
-    object_ids   dense ids of the shapes of the scene at hand
+    object_ids   ids of the shapes of the scene at hand
     emitters     how shadow rays choose an emitter
     cache        irradiance on the patches; None while it is being made, when a path's only end in
                  a patch is recorded

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+from collections.abc import Collection
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -86,14 +87,17 @@ class StateKey:
     scene: str
     settings: Settings
 
-    def refuses(self, scene: str, settings: dict[str, Any]) -> str:
-        """How the key of a stored state, as plain values, differs; nothing if it's the same."""
+    def refuses(self, scene: str, settings: dict[str, Any], but: Collection[str] = ()) -> str:
+        """How the key of a stored state, as plain values, differs; nothing if it's the same.
+
+        ``but`` are names of clusters that may have been asked for otherwise.
+        """
         if scene != self.scene:
             differing = difference(scene, self.scene)
             return "made for another scene" + (f": it has other {differing}" if differing else "")
         theirs, ours = _flat(settings), _flat(_plain(self.settings))
         for name in ours | theirs:
-            if theirs.get(name) != ours.get(name):
+            if theirs.get(name) != ours.get(name) and name.rpartition(".")[0] not in but:
                 return (
                     f"made with {name}={theirs.get(name)!r}, not {name}={ours.get(name)!r} "
                     "(pass the same settings as there)"
@@ -178,21 +182,28 @@ def save(path: str | os.PathLike, prepared: BakedState) -> None:
     write(path, parts, metadata)
 
 
-def load(path: str | os.PathLike, key: StateKey, owner: str, n_emitters: int) -> BakedState:
+def load(
+    path: str | os.PathLike,
+    key: StateKey,
+    owner: str,
+    n_emitters: int,
+    but: Collection[str] = (),
+) -> BakedState:
     """Read a prepared state; ``ValueError`` if the file holds none that belongs to ``key``.
 
-    ``n_emitters`` is the number of emitters of the scene.
+    ``n_emitters`` is the number of emitters of the scene; ``owner`` wants the file; ``but`` are
+    those of ``StateKey.refuses``.
     """
-    path = mi.file_resolver().resolve(path)
+    path = mi.file_resolver().resolve(str(path))
     try:
-        return _prepared(read(path, "make it again with envmap-render bake"), key, n_emitters)
+        return _prepared(read(path, "make it again with envmap-render bake"), key, n_emitters, but)
     except StorageError as error:
-        raise ValueError(f'{owner}: "cache_file" {error}') from None
+        raise ValueError(f"{owner} {error}") from None
 
 
-def _prepared(stored: Stored, key: StateKey, n_emitters: int) -> BakedState:
+def _prepared(stored: Stored, key: StateKey, n_emitters: int, but: Collection[str]) -> BakedState:
     (asked,) = stored.entries("asked")
-    difference = key.refuses(stored.text("scene"), asked.metadata)
+    difference = key.refuses(stored.text("scene"), asked.metadata, but)
     if difference:
         raise stored.refusal(difference)
 

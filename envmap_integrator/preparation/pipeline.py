@@ -51,10 +51,12 @@ def prepare(
     settings: Settings,
     sensors: list[mi.Sensor],
     owner: str,
+    kept: tuple[CubeMap, ...] = (),
 ) -> BakedState:
     """Run the pre-passes for the views of some sensors.
 
-    ``state`` is that of the scene; ``settings`` are those ``asked`` for, ``for_render``. Raises
+    ``state`` is that of the scene; ``settings`` are those ``asked`` for, ``for_render``. Maps that
+    are ``kept`` aren't baked again for the clusters of their names. Raises
     ``ValueError``, in the name of ``owner``, if there is too little memory for them.
     """
     check_memory(
@@ -103,7 +105,7 @@ def prepare(
         with _timed(times, "maps"):
             members = [points.take(cluster_of_point == i) for i in range(len(clusters))]
             lookup = replace(lookup, cache=solution.cache)
-            maps = _baked(scene, lookup, clusters, members, settings, owner)
+            maps = _baked(scene, lookup, clusters, members, settings, owner, kept)
     return BakedState(
         StateKey(state.fingerprint, asked),
         solution.cache,
@@ -122,12 +124,13 @@ def _clusters(scene, mesh, solution, settings, owner):
     """Those that are listed, or those found whose maps would pay: see ``find_clusters``."""
     points, space = mesh.points, mesh.space_of_point
     excluded = shapes_named(scene, settings.no_cluster, f'{owner}: "no_cluster"')
+    excluded = np.isin(points.object_id, excluded)
     share = np.where(mesh.patch_of_point >= 0, solution.escaped_share[mesh.patch_of_point], 0)
     if settings.requests:
         found = listed_clusters(points, space, scene, settings.requests, settings.distance_ratio)
     # Clusters are only looked for if they would pay at least if everything belonged to one.
     elif settings.map_always or worthwhile(benefit(points, share)):
-        found = find_clusters(points, space, settings.distance_ratio, excluded[points.object_id])
+        found = find_clusters(points, space, settings.distance_ratio, excluded)
     else:
         found = [], np.full(len(points), -1)
     clusters, cluster_of_point = found
@@ -141,7 +144,7 @@ def _clusters(scene, mesh, solution, settings, owner):
     return clusters, cluster_of_point
 
 
-def _baked(scene, lookup, clusters, members, settings, owner) -> tuple[CubeMap, ...]:
+def _baked(scene, lookup, clusters, members, settings, owner, kept) -> tuple[CubeMap, ...]:
     asked = {request.name: request.resolution for request in settings.requests}
     resolutions = [asked.get(c.name) or settings.map_resolution for c in clusters]
     rules = as_baked(settings.map_shadow_samples)
@@ -150,9 +153,11 @@ def _baked(scene, lookup, clusters, members, settings, owner) -> tuple[CubeMap, 
         found = camera_radiance(scene, lookup, rules, sampler, ray, active)
         return found.radiance, found.distance
 
-    maps = {}
-    for resolution in sorted(set(resolutions)):
-        chosen = [i for i, its in enumerate(resolutions) if its == resolution]
+    had = {cube_map.cluster.name: cube_map for cube_map in kept}
+    maps = {i: had[c.name] for i, c in enumerate(clusters) if c.name in had}
+    missing = [i for i in range(len(clusters)) if i not in maps]
+    for resolution in sorted({resolutions[i] for i in missing}):
+        chosen = [i for i in missing if resolutions[i] == resolution]
         check_memory(
             owner,
             f"{len(chosen)} maps of {resolution} x {resolution} texels a face",

@@ -20,7 +20,7 @@ class SceneState:
 
     content       its objects and the arrays that their parameters are in
     fingerprint   hash of the values of these
-    ids           dense ids of its shapes
+    ids           ids of its shapes
     emitters      its emitters
     """
 

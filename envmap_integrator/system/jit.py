@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -64,6 +65,29 @@ def mix(h: mi.UInt32) -> mi.UInt32:
 def unit(bits: mi.UInt32) -> mi.Float:
     """A number in [0, 1) from the upper bits of a random integer."""
     return mi.Float(bits >> 8) / 16777216.0
+
+
+@dataclass
+class KeyedNumbers:
+    """Independent random numbers by key, not by lane, as Mitsuba's samplers give them."""
+
+    generator: mi.PCG32
+
+    @classmethod
+    def of(cls, seed: int, key: mi.UInt32, number: mi.UInt32) -> KeyedNumbers:
+        """A sequence for each key and number; the same for the same seed."""
+        state, stream = mi.sample_tea_32(key ^ dr.opaque(mi.UInt32, seed), number)
+        generator = mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(stream))
+        return cls(generator)
+
+    def next_1d(self, active: mi.Bool | bool = True) -> mi.Float:
+        """A number in [0, 1)."""
+        return mi.Float(self.generator.next_float32(active))
+
+    def next_2d(self, active: mi.Bool | bool = True) -> mi.Point2f:
+        """A point in the unit square."""
+        x = self.next_1d(active)
+        return mi.Point2f(x, self.next_1d(active))
 
 
 class SpareNumbers:

@@ -1,12 +1,17 @@
-"""A fixed order of the shapes of a scene."""
+"""A fixed order of the shapes of a scene, and ids that last while others move."""
 
 from __future__ import annotations
 
 from itertools import groupby
 
 import mitsuba as mi
+import numpy as np
+from blake3 import blake3
 
 from .fingerprint import content_digest
+
+#: Bits of a lasting id: as many as the names of patches have room for.
+ID_BITS = 25
 
 
 def ordered_shapes(scene: mi.Scene) -> list[mi.Shape]:
@@ -20,6 +25,22 @@ def ordered_shapes(scene: mi.Scene) -> list[mi.Shape]:
         # Reading all that they are takes long, and is seldom needed.
         ordered += sorted(tied, key=content_digest) if len(tied) > 1 else tied
     return ordered
+
+
+def lasting_ids(ordered: list[mi.Shape]) -> np.ndarray:
+    """An id [S] of ``ID_BITS`` for each of the shapes of a scene, as ``ordered_shapes`` has them.
+
+    It's a hash of a shape's box and kind: that of one that stands still stays the same while others
+    move, which changes the order. No two are the same.
+    """
+    taken: dict[int, None] = {}
+    for shape in ordered:
+        digest = blake3(repr(_key(shape)).encode()).digest(length=4)
+        its = int.from_bytes(digest, "little") % (1 << ID_BITS)
+        while its in taken:  # Shapes in the same place, or by chance.
+            its = (its + 1) % (1 << ID_BITS)
+        taken[its] = None
+    return np.array([*taken], dtype=np.uint32)
 
 
 def ordered_emitters(scene: mi.Scene) -> list[mi.Emitter]:

@@ -20,7 +20,7 @@ class Vertex:
     si, bsdf           the surface
     hit                whether there is one,
     smooth             ... and whether it reflects light from emitters
-    normal, object_id  geometric normal on the side that was hit, and dense id of the shape
+    normal, object_id  geometric normal on the side that was hit, and id of the shape
     cell               large cell of the coarse mesh
     emitter_row        of the choice among emitters there
     cube               bounds secondary rays from it; None without maps

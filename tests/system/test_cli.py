@@ -18,6 +18,7 @@ from envmap_integrator.imaging.denoiser import denoise
 from envmap_integrator.system import progress
 from envmap_integrator.system.atomic import StorageError
 from envmap_integrator.system.scene_file import SceneFile
+from envmap_integrator.system.storage import read
 from tests.helpers import at_most, unprivileged
 
 SCENE = """
@@ -296,6 +297,25 @@ def test_bake_saves_the_state(scene, preparing_integrator, tmp_path, capsys):
     assert run("bake", scene, "-o", output, "--integrator", preparing_integrator) == 0
     assert output.read_text() == "baked"
     assert "maps: desk (8 x 8)" in capsys.readouterr().out
+
+
+def test_bake_leaves_other_clusters_as_they_are(tmp_path):
+    apart = PAIR
+    for name, y in (("left", -1), ("right", 1.2)):
+        move = f'<transform name="to_world"> <translate x="-1.2" y="{y}" z="0.1"/> </transform>'
+        apart = apart.replace(f'id="{name}">', f'id="{name}"> {move}')
+    scene, state = write_scene(tmp_path, apart), tmp_path / "state.exr"
+    options = [scene, "-o", state, "--integrator", "envmap_hybrid"]
+    for setting in ("patches=256", "map_resolution=4", "a.shapes=left", "b.shapes=right"):
+        options += ["--set", setting]
+    assert run("bake", *options) == 0
+    before = read(state, "").parts
+    assert run("bake", *options, "--set", "b.resolution=8", "--clusters", "b") == 0
+    after = read(state, "").parts
+    assert after["map1/level0"]["inverse_distance"].shape == (8, 48)
+    for part in before.keys() - {name for name in before if name.startswith("map1/")}:
+        for channel, image in before[part].items():
+            np.testing.assert_array_equal(after[part][channel], image)
 
 
 @pytest.mark.parametrize(

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import mitsuba as mi
+import numpy as np
 import pytest
 
+from envmap_integrator.preparation.maps.bake import bake_maps
 from envmap_integrator.system.scene_file import SceneFile
 from tests.helpers import cluster, integrator, load, picture, room
 
@@ -124,3 +126,43 @@ def test_shapes_that_are_excluded_keep_their_ids(tmp_path):
 def test_a_child_that_is_not_there_is_named(tmp_path):
     with pytest.raises(ValueError, match='holds no "tabel", only desk; set "tabel.shapes" too'):
         scene_file(tmp_path, DESK, tabel__resolution=8)
+
+
+# ---------------------- Baked anew ----------------------
+
+
+def test_one_map_is_baked_anew_and_all_else_stays(scene, tmp_path):
+    """What comes out is what baking everything makes, and fits where that would."""
+    path = tmp_path / "state.exr"
+    was = integrator("envmap_hybrid", **SMALL, **clusters())
+    was.prepare(scene).save(path)
+    ours = integrator("envmap_hybrid", **SMALL, **clusters(resolution=32))
+    anew = ours.rebake(scene, path, ["two"])
+    anew.save(path)
+    whole = integrator("envmap_hybrid", **SMALL, **clusters(resolution=32)).prepare(scene)
+    settings = SMALL | {"cache_file": str(path)}
+    read = integrator("envmap_hybrid", **settings, **clusters(resolution=32)).prepare(scene)
+    for state in (anew, read):
+        assert state.cache.same_as(whole.cache)
+        assert np.array_equal(state.cluster_of_cell, whole.cluster_of_cell)
+        for ours, theirs in zip(state.maps, whole.maps, strict=True):
+            assert ours.cluster.name == theirs.cluster.name
+            for level, expected in zip(ours.levels, theirs.levels, strict=True):
+                assert np.array_equal(level, expected)
+    with pytest.raises(ValueError, match="made with two.resolution=32, not two.resolution=None"):
+        integrator("envmap_hybrid", **settings, **clusters()).prepare(scene)
+
+
+def test_maps_that_stay_are_not_baked(scene, tmp_path, monkeypatch):
+    path = tmp_path / "state.exr"
+    ours = integrator("envmap_hybrid", **SMALL, **clusters())
+    ours.prepare(scene).save(path)
+    baked = []
+
+    def bake(scene, radiance_distance, clusters, *rest, **more):
+        baked.extend(cluster.name for cluster in clusters)
+        return bake_maps(scene, radiance_distance, clusters, *rest, **more)
+
+    monkeypatch.setattr("envmap_integrator.preparation.pipeline.bake_maps", bake)
+    ours.rebake(scene, path, ["two"])
+    assert baked == ["two"]

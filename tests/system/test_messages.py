@@ -162,6 +162,15 @@ def use(make: Callable[[Surroundings], Path]) -> Callable:
     )
 
 
+def rebake(name: str, make: Callable[[Surroundings], Path]) -> Callable:
+    """Bake one map anew in the file that ``make`` leaves."""
+    return lambda s: integrator("envmap_hybrid", **SETTINGS).rebake(load(room()), make(s), [name])
+
+
+def brighter(parts: dict, metadata: dict) -> None:
+    parts["irradiance"]["Y"] = 2 * parts["irradiance"]["Y"]
+
+
 def seen_from_elsewhere(s: Surroundings) -> None:
     """From beneath the floor, where no sensor of the scene has been."""
     below = mi.load_dict(camera(origin=(0, -1.8, -5), target=(0, 0.5, -9)))
@@ -263,6 +272,7 @@ def command_line(**options: object) -> argparse.Namespace:
     defaults = {"mode": "llvm_ad_rgb", "threads": None, "define": [], "set": [], "debug": False}
     defaults |= {"integrator": None, "sensor": 0, "spp": 1, "seed": 0, "png": False}
     defaults |= {"progressive": False, "time": None, "target_error": None, "resume": False}
+    defaults |= {"clusters": None}
     defaults |= {"quiet": True, "json": False, "workers": None, "cluster": None, "tls": None}
     return argparse.Namespace(**defaults | {"denoise": False} | options)
 
@@ -598,6 +608,14 @@ CASES = {
         seen_from_elsewhere, '"cache_file" {folder}/state.exr', "other views", AGAIN
     ),
     "another scene": Case(use(altered(setting("scene", "a"))), STATE, "another scene", AGAIN),
+    "no such cluster": Case(
+        rebake("chair", lambda s: s.state),
+        "{state}", 'no cluster "chair", but desk', "name one of them",
+    ),
+    "another cache": Case(
+        rebake("desk", altered(brighter)), "altered.exr", "another irradiance cache",
+        "bake it whole",
+    ),
     "sources": Case(
         use(altered(wrong_rows)), STATE, "rows for 1 emitters", AGAIN
     ),
@@ -777,6 +795,10 @@ CASES = {
     "another sensor": Case(no_such_sensor, "sensor 3", "the scene has 1", "count from 0"),
     "no Dask": Case(without_dask, "Dask", "is missing", "pip install distributed"),
     "no workers": Case(shell(commands.render, workers=0), "--workers", "0", "must be at least 1"),
+    "no clusters": Case(
+        shell(commands.bake, integrator="one_level_path", clusters="desk"),
+        "--clusters", '"one_level_path" has none', "pass --integrator envmap_hybrid",
+    ),
     "nothing to bake": Case(
         shell(commands.bake), "integrator", '"path"', "pass --integrator envmap_hybrid"
     ),

@@ -31,7 +31,8 @@ def found(distance: float, primary: bool = False, n: int = 1 << 14) -> float:
     table = dr.full(mi.Float, dr.pi, 2 * coarse.patches.count * len(mi.Spectrum()))
     lookup = replace(coarse.lookup(), cache=IrradianceCache(coarse.patches, table))
     rules = PathRules(gather_depth=0 if primary else 1)
-    place = surface_points(np.array([[0.01, 0.02, -WALL]]), [0, 0, 1])
+    (wall,) = coarse.object_ids.table.numpy()[coarse.object_ids.table.numpy() > 0]
+    place = surface_points(np.array([[0.01, 0.02, -WALL]]), [0, 0, 1], wall)
     size = float(coarse.find(place)[1][0])
 
     sampler = mi.load_dict({"type": "independent"})

@@ -33,13 +33,13 @@ def build_mesh(
     if len(points) == 0:  # Nothing but mirrors and glass.
         empty = np.zeros(0, dtype=np.int64)
         return CoarseMesh(points, _no_patches(), empty, empty, empty)
-    (low, _), extent = points.box, points.extent
+    extent = points.extent
     position, normal, object_id = points.places()
     size = extent * LARGE_CELL
     while True:
         # An irrational offset keeps walls, mostly at round coordinates, off the cell borders.
         patches = Patches(
-            origin=opaque_point(low - size * np.array([0.3819, 0.4142, 0.2361])),
+            origin=opaque_point(points.corner - size * np.array([0.3819, 0.4142, 0.2361])),
             size=dr.opaque(mi.Float, size),
             levels=mi.UInt32(0),
             cells=mi.UInt32(0),

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.sparse import coo_matrix
 
-from ...lookup.patches import PARTS
+from ...lookup.patches import MARK_BITS, PARTS
 from ...system.jit import upload
 from .mesh import CoarseMesh
 
@@ -26,6 +26,8 @@ class PatchPoints:
     index              which points stand for patches, sorted
     cells     [K]      large cell of each patch, -1 if it has none
     n_cells            number C of large cells in the mesh
+    keys      [K]      hashes of the places of the patches, which random numbers go by: they stay
+                       the same where nothing moves, whatever does elsewhere
     points             all surface points
     """
 
@@ -37,6 +39,7 @@ class PatchPoints:
         by_patch = coo_matrix((standing, place), (mesh.patches.count, len(standing))).tocsr()
         self.patches = np.flatnonzero(np.diff(by_patch.indptr))
         self.first = np.append(by_patch.indptr[self.patches], len(standing)).astype(np.uint32)
+        self.keys = mesh.patches.cells.numpy()[self.patches] >> np.uint32(MARK_BITS)
         self.points = points
         self._mesh = mesh
         self.n_cells = dr.width(mesh.patches.levels)

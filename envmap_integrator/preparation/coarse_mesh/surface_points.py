@@ -6,6 +6,7 @@ curves. The cost doesn't depend on the number of triangles.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -27,8 +28,10 @@ MAX_BATCHES, ENOUGH, MAX_RAYS = 4, 0.9, 8
 LOBES = 8
 #: Cosine of the angle by which rounding may turn a normal.
 UNTURNED = 1 - 1e-5
-#: Points from which the extent of all is told.
-EXTENT_POINTS = 1 << 14
+#: Points from which the extent of all is told, and steps of it per octave.
+EXTENT_POINTS, EXTENT_STEPS = 1 << 14, 16
+#: Steps of the place of a sphere or a grid, as a part of its size.
+SPHERE_STEP, GRID_STEP = 1 / 64, 1 / 4
 #: Spaces that the rays of one sensor may start in; what is left is taken for one more.
 MOST_STARTS = 8
 
@@ -40,7 +43,7 @@ class SurfacePoints:
     position        [N, 3]  world space
     normal          [N, 3]  geometric normal, facing the side the point belongs to
     shading_normal  [N, 3]  shading normal of the material, on the same side
-    object_id       [N]     dense index of the top-level shape (``ObjectIds``)
+    object_id       [N]     id of the top-level shape (``ObjectIds``)
     material        [N]     2 * Dr.Jit's id of the BSDF, + 1 on the back of the surface
     seen            [N]     1 + the sensor's index for a point on a walk from it, 0 on a global line
     turned          [N]     whether a bump or normal map turns the shading normal
@@ -75,13 +78,21 @@ class SurfacePoints:
 
     @cached_property
     def extent(self) -> float:
-        """Diagonal of the box that holds most points, of walks if there are any."""
+        """Diagonal of the box that holds most points, of walks if there are any; in steps."""
+        low, high = self._most
+        return in_steps(max(float(np.linalg.norm(high - low)), 1e-30))
+
+    @cached_property
+    def corner(self) -> np.ndarray:
+        """Lowest corner [3] of that box, in steps."""
+        return snapped(self._most[0], GRID_STEP * self.extent)
+
+    @cached_property
+    def _most(self) -> tuple[np.ndarray, np.ndarray]:
         if len(self) == 0:
-            return 1.0
+            return np.zeros(3), np.full(3, 3**-0.5)
         seen = self.seen > 0
-        some = self.position[seen] if seen.any() else self.position
-        low, high = np.percentile(some[:: max(len(some) // EXTENT_POINTS, 1)], [2, 98], axis=0)
-        return max(float(np.linalg.norm(high - low)), 1e-30)
+        return _usual(self.position[seen] if seen.any() else self.position)
 
     def interaction(self, index: mi.UInt32) -> mi.SurfaceInteraction3f:
         """The points of the given indices, as interactions from which rays can start."""
@@ -251,10 +262,28 @@ def _spheres(scene: mi.Scene, walks: list[SurfacePoints]) -> np.ndarray:
 
 def _around(position: np.ndarray) -> list[float]:
     """Centre and radius of a sphere about most of some positions [N, 3]."""
-    some = position[:: max(len(position) // EXTENT_POINTS, 1)]
-    low, high = np.percentile(some, [2, 98], axis=0)
+    low, high = _usual(position)
     diagonal = 1.05 * (high - low)  # What is cut off where a box is filled evenly.
-    return [*(low + high) / 2, 0.5 * float(np.linalg.norm(diagonal))]
+    radius = in_steps(0.5 * float(np.linalg.norm(diagonal)) * (1 + SPHERE_STEP), up=True)
+    return [*snapped((low + high) / 2, SPHERE_STEP * radius), radius]
+
+
+def _usual(position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of a box that holds most of some positions [N, 3]."""
+    some = position[:: max(len(position) // EXTENT_POINTS, 1)]
+    return tuple(np.percentile(some, [2, 98], axis=0).astype(np.float64))
+
+
+def in_steps(length: float, up: bool = False) -> float:
+    """A length above 0, rounded: what is told from points at random, or by where something that
+    moves happens to be, would change all patches with every frame of an animation."""
+    octaves = EXTENT_STEPS * math.log2(length) + 0.2764
+    return 2 ** ((math.ceil(octaves) if up else round(octaves)) / EXTENT_STEPS)
+
+
+def snapped(place: np.ndarray, step: float) -> np.ndarray:
+    """A place, likewise; shifted, as many things stand at round numbers."""
+    return step * (np.round(place / step - 0.2764) + 0.2764)
 
 
 def _enough(trace, count: int, n_hits: int) -> list[SurfacePoints]:

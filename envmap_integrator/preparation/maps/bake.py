@@ -5,10 +5,11 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from blake3 import blake3
 
 from ...lookup.cube import exit_distance, face_to_direction
 from ...lookup.cube_map import Cluster, CubeMap
-from ...system.jit import upload
+from ...system.jit import KeyedNumbers, mix, upload
 from ...system.progress import stage
 from ...system.ray_counts import Ray, count
 from ...system.spectrum import n_packets, n_stored, packet_wavelengths
@@ -37,13 +38,16 @@ def bake_maps(
     start on the cube. Where a start lies behind geometry, no ray of the cluster ever leaves there:
     such texels, recognised because no point of the cluster sees the start, are masked and filled
     before mip-mapping. ``samples`` rays per texel, a power of two; packets of wavelengths share
-    them.
+    them. Random numbers go by the names of clusters: a map comes out the same whatever else is
+    baked.
     """
     if not clusters:
         return ()
     n_texels = len(clusters) * 6 * resolution**2
     centres = upload(mi.Float, np.stack([cluster.centre for cluster in clusters]))
     half_widths = upload(mi.Float, np.array([cluster.half_width for cluster in clusters]))
+    names = (blake3(cluster.name.encode()).digest(length=4) for cluster in clusters)
+    keys = upload(mi.UInt32, np.array([int.from_bytes(name, "little") for name in names]))
     members = SurfacePoints.concatenate(points)
     first = upload(mi.UInt32, np.cumsum([0, *map(len, points)]))
     resolution_ = dr.opaque(mi.UInt32, resolution)
@@ -57,8 +61,6 @@ def bake_maps(
     with stage("Baking maps", total=n_texels) as advance:
         for begin in range(0, n_texels, launch):
             end = min(begin + launch, n_texels)
-            sampler = mi.load_dict({"type": "independent"})
-            sampler.seed(seed + begin, (end - begin) * samples)
             lane = dr.arange(mi.UInt32, (end - begin) * samples)
             index = dr.opaque(mi.UInt32, begin) + (
                 lane >> dr.opaque(mi.UInt32, int(np.log2(samples)))
@@ -71,6 +73,8 @@ def bake_maps(
                 index % resolution_,
             )
             cluster, face = face // 6, face % 6
+            key = dr.gather(mi.UInt32, keys, cluster) ^ mix(index - cluster * 6 * n_pixels)
+            sampler = KeyedNumbers.of(seed, key, lane & (dr.opaque(mi.UInt32, samples) - 1))
             u = mi.Point2f(mi.Float(x), mi.Float(y)) + sampler.next_2d()
             d = dr.normalize(face_to_direction(face, 2 * u / mi.Float(resolution_) - 1))
             centre = dr.gather(mi.Point3f, centres, cluster)

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 
 from ...lookup.cube_map import Cluster
-from ...system.scene_order import ordered_shapes
+from ...system.scene_order import lasting_ids, ordered_shapes
 from ..coarse_mesh.mesh import CoarseMesh
 from ..coarse_mesh.surface_points import SurfacePoints
 
@@ -74,7 +74,7 @@ def listed_clusters(
             if shape_id in listed:
                 raise ValueError(f'{owner}: shape "{shape_id}" is listed twice; list it once')
             listed.append(shape_id)
-        member = members[points.object_id]
+        member = np.isin(points.object_id, members)
         if not member.any():
             mi.Log(
                 mi.LogLevel.Warn,
@@ -102,11 +102,12 @@ def listed_clusters(
 
 
 def shapes_named(scene: mi.Scene, names: tuple[str, ...], owner: str) -> np.ndarray:
-    """Which shapes of a scene, in their fixed order, have one of these ids, [S].
+    """Lasting ids of the shapes of a scene that have one of these names.
 
     Raises ``ValueError``, in the name of ``owner``, if one isn't in the scene.
     """
-    ids = [shape.id() for shape in ordered_shapes(scene)]
+    shapes = ordered_shapes(scene)
+    ids = [shape.id() for shape in shapes]
     for name in names:
         if name not in ids:
             # Those first that are most alike.
@@ -115,7 +116,7 @@ def shapes_named(scene: mi.Scene, names: tuple[str, ...], owner: str) -> np.ndar
                 f'{owner}: the scene has no shape "{name}"; it has {_some(known)} '
                 "(in Python, load with optimize=False: Mitsuba merges meshes that share a material)"
             )
-    return np.isin(ids, names)
+    return lasting_ids(shapes)[np.isin(ids, names)]
 
 
 def find_clusters(

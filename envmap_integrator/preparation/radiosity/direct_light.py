@@ -10,7 +10,7 @@ import numpy as np
 
 from ...lookup.emitter_choice import EmitterChoice, Emitters
 from ...lookup.patches import normal_direction
-from ...system.jit import mean_channel, upload, upload_vectors
+from ...system.jit import KeyedNumbers, mean_channel, upload, upload_vectors
 from ...system.ray_counts import Ray, count
 from ...system.spectrum import random_wavelengths
 from ..coarse_mesh.build import cell_keys
@@ -57,9 +57,11 @@ def survey_direct_light(
     n = len(members.patches) * SAMPLES
     if n == 0:
         return DirectLight(members, mi.Float(), mi.UInt32(), mi.Point3f())
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(seed, n)
-    point = members.sample(dr.arange(mi.UInt32, n) // SAMPLES, sampler.next_1d())
+    lane = dr.arange(mi.UInt32, n)
+    member = lane // SAMPLES
+    key = dr.gather(mi.UInt32, upload(mi.UInt32, members.keys), member)
+    sampler = KeyedNumbers.of(seed, key, lane % SAMPLES)
+    point = members.sample(member, sampler.next_1d())
     si = mesh.points.interaction(point)
     si.wavelengths = random_wavelengths(sampler)
     choice = by_weight(emitters)

@@ -15,7 +15,7 @@ import numpy as np
 from ...lookup.irradiance_cache import packet_row
 from ...lookup.lookup import Lookup
 from ...lookup.patches import PARTS
-from ...system.jit import R1, R2, mean_channel, mix, unit, upload
+from ...system.jit import R1, R2, KeyedNumbers, mean_channel, mix, unit, upload
 from ...system.progress import stage
 from ...system.spectrum import packet_wavelengths
 from ...transport.direct_light import mis_weight
@@ -126,15 +126,18 @@ def gather(
     """Send a block of rays, ``samples`` of them, from surface points for each unknown in ``rank``.
 
     Rays start from random ones of the points, with as many shadow rays. ``samples`` must be a power
-    of two.
+    of two, and ``rank`` ascend.
     """
     launch = max(MAX_LANES // samples, 1)
+    # Random numbers go by where a patch is and which of its blocks it is.
+    member, packet = np.divmod(rank, unknowns.packets)
+    number = (np.arange(len(rank)) - np.searchsorted(rank, rank)) * unknowns.packets + packet
+    key = unknowns.members.keys[member] ^ (number * 0x9E3779B1).astype(np.uint32)
     found = []
     with stage("Gathering irradiance", total=len(rank)) as advance:
         for begin in range(0, len(rank), launch):
-            some = rank[begin : begin + launch]
-            seed_ = seed + 1 + begin
-            found.append(_gather(scene, lookup, unknowns, incidence, some, samples, seed_))
+            some, keys = rank[begin : begin + launch], key[begin : begin + launch]
+            found.append(_gather(scene, lookup, unknowns, incidence, some, keys, samples, seed + 1))
             advance(len(some))
     return GatherRays.concatenate(found)
 
@@ -146,28 +149,26 @@ def block_mean(value: mi.Spectrum | mi.Float, samples: int) -> mi.Spectrum | mi.
     return type(value)(*(dr.block_sum(c, samples) / samples for c in value))
 
 
-def _gather(scene, lookup, unknowns, incidence, rank, samples, seed) -> GatherRays:
+def _gather(scene, lookup, unknowns, incidence, rank, keys, samples, seed) -> GatherRays:
     members, packets = unknowns.members, unknowns.packets
     n_lanes = len(rank) * samples
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(seed, n_lanes)
     lane = dr.arange(mi.UInt32, n_lanes)
     block = lane >> dr.opaque(mi.UInt32, int(np.log2(samples)))
     member, packet = dr.gather(mi.UInt32, upload(mi.UInt32, rank), block), mi.UInt32(0)
     if packets > 1:
         member, packet = member // packets, member % packets
+    key = dr.gather(mi.UInt32, upload(mi.UInt32, keys), block)
     k = lane & (dr.opaque(mi.UInt32, samples) - 1)
+    sampler = KeyedNumbers.of(seed, key, k)
     point = members.sample(member, sampler.next_1d())
     si = members.points.interaction(point)
     patch = dr.gather(mi.UInt32, upload(mi.UInt32, members.patches), member)
     start_place = PARTS * patch + dr.gather(mi.UInt32, members.parts, point)
 
     # ---- Low-discrepancy numbers, rotated at random for each block (Cranley-Patterson) ----
-    u = _rotated(
-        mi.Float(k) / dr.opaque(mi.Float, samples), mi.radical_inverse_2(k, 0), block, seed
-    )
-    v = _rotated(mi.Float(k) * R2[0], mi.Float(k) * R2[1], block, ~seed & 0xFFFFFFFF)
-    within_bin = _rotated(mi.Float(k) * R1, 0, block, seed ^ 0x55555555).x
+    u = _rotated(mi.Float(k) / dr.opaque(mi.Float, samples), mi.radical_inverse_2(k, 0), key, seed)
+    v = _rotated(mi.Float(k) * R2[0], mi.Float(k) * R2[1], key, ~seed & 0xFFFFFFFF)
+    within_bin = _rotated(mi.Float(k) * R1, 0, key, seed ^ 0x55555555).x
     si.wavelengths = packet_wavelengths(packet, within_bin)
 
     # ---- Direction: cosine ----
@@ -259,10 +260,10 @@ def without_growth(
     return replace(rays, weight=weight)
 
 
-def _rotated(x, y, block, seed) -> mi.Point2f:
-    """A point set moved round the unit square, by another shift for every block."""
+def _rotated(x, y, key, seed) -> mi.Point2f:
+    """A point set moved round the unit square, by another shift for every block's key."""
     seed_ = dr.opaque(mi.UInt32, seed)
-    bits = (mix(mix(2 * block + axis) ^ seed_) for axis in range(2))
+    bits = (mix(mix(2 * key + axis) ^ seed_) for axis in range(2))
     shift = mi.Point2f(*map(unit, bits))
     point = mi.Point2f(x, y) + shift
     return point - dr.floor(point)

@@ -28,8 +28,8 @@ from .unknowns import Unknowns
 #: patches: each by its own irradiance, as the sunlit outside of a house says nothing of its rooms.
 TOLERANCE = 1e-5
 #: Bounces that are followed one by one, those between tests of that (each makes the host wait), and
-#: directions that the rest is searched in at a time.
-MAX_BOUNCES, CHECK_EVERY, KRYLOV = 64, 4, 32
+#: directions that the rest is searched in at a time, and how often at most.
+MAX_BOUNCES, CHECK_EVERY, KRYLOV, CYCLES = 64, 4, 32, 8
 #: What part of the further rays is sent at a time, and what sets the seeds apart.
 MORE, SEED_STEP = (0.25, 0.75), 0x10001
 
@@ -171,7 +171,7 @@ def _all_bounces(bounce, light: mi.Float, scale: mi.Float) -> mi.Float:
 
     system = LinearOperator((n, n), remaining, dtype=np.float64)
     found, unsolved = gmres(
-        system, light / scale, rtol=0, atol=TOLERANCE * np.sqrt(n), restart=KRYLOV, maxiter=2
+        system, light / scale, rtol=0, atol=TOLERANCE * np.sqrt(n), restart=KRYLOV, maxiter=CYCLES
     )
     if unsolved or np.any(scale * found < 0.99 * light):
         found = light / scale
