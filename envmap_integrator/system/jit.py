@@ -24,11 +24,13 @@ def upload(dtype: type, values: np.ndarray) -> mi.Float | mi.UInt32:
     Dr.Jit maps NumPy's memory as it is. Where that isn't aligned, which is a matter of chance,
     packed gathers fall apart into scalar ones and every kernel is compiled again.
     """
-    values = np.asarray(values, dtype=np.float32 if dr.is_float_v(dtype) else np.uint32).ravel()
-    memory = np.empty(values.nbytes + _ALIGNMENT, dtype=np.uint8)
+    values = np.asarray(values)
+    own = np.dtype(np.float32 if dr.is_float_v(dtype) else np.uint32)
+    n_bytes = own.itemsize * values.size
+    memory = np.empty(n_bytes + _ALIGNMENT, dtype=np.uint8)
     begin = -memory.ctypes.data % _ALIGNMENT
-    aligned = memory[begin : begin + values.nbytes].view(values.dtype)
-    aligned[:] = values
+    aligned = memory[begin : begin + n_bytes].view(own)
+    np.copyto(aligned.reshape(values.shape), values, casting="unsafe")
     return dtype(aligned)
 
 

@@ -14,6 +14,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from ...lookup.ids import ObjectIds
+from ...system.grouping import grouped
 from ...system.jit import upload
 from ...system.ray_counts import Ray, count
 from .mesh import CoarseMesh
@@ -46,7 +47,7 @@ def find_spaces(scene: mi.Scene, mesh: CoarseMesh, seed: int = 0) -> CoarseMesh:
     walk = points.seen.astype(np.int64)
     if points.start.any():
         starts = walk[walked] * (points.start.max() + 1) + points.start[walked]
-        walk[walked] = 1 + np.unique(starts, return_inverse=True)[1]
+        walk[walked] = 1 + grouped(starts).index
     space = np.where(walk > 0, 0, -1)
     sight = _Sight(scene, points)
     if walk.max() > 1:

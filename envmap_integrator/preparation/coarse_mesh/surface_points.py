@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...lookup.ids import ObjectIds
-from ...system.jit import mean_channel, upload, upload_vectors
+from ...system.jit import mean_channel, upload
 from ...system.ray_counts import Ray, count
 
 #: Hits followed along each global line, and along each walk from a sensor.
@@ -110,11 +110,19 @@ class SurfacePoints:
 
     def places(self) -> tuple[mi.Point3f, mi.Normal3f, mi.UInt32]:
         """All points as kernels look them up in a coarse mesh: position, normal and object id."""
-        return (
-            upload_vectors(mi.Point3f, self.position),
-            upload_vectors(mi.Normal3f, self.normal),
-            upload(mi.UInt32, self.object_id),
-        )
+        position, normal, object_id = self._places
+        return mi.Point3f(position), mi.Normal3f(normal), mi.UInt32(object_id)
+
+    @cached_property
+    def _places(self):
+        position, normal, _ = self._vectors
+        places = dr.unravel(mi.Point3f, position), dr.unravel(mi.Normal3f, normal)
+        dr.eval(places)
+        return *places, upload(mi.UInt32, self.object_id)
+
+    def sensors(self, among: np.ndarray | slice = np.s_[:]) -> np.ndarray:
+        """Values that ``seen`` has for points on walks ``among`` some of the points."""
+        return 1 + np.flatnonzero(np.bincount(self.seen[among].astype(np.int64))[1:])
 
     def take(self, index: np.ndarray) -> SurfacePoints:
         """The points of the given indices, in that order, or those of a mask."""
@@ -240,7 +248,7 @@ def _spheres(scene: mi.Scene, walks: list[SurfacePoints]) -> np.ndarray:
     """
     spheres = []
     points = SurfacePoints.concatenate(walks) if walks else None
-    for number in np.unique(points.seen) if points else ():
+    for number in points.sensors() if points else ():
         spheres.append(_around(points.position[points.seen == number]))
     if not spheres:
         sphere = scene.bbox().bounding_sphere()
@@ -378,7 +386,7 @@ def _hits_along(
     dr.eval(kept, turned, reflects)
     chosen = np.flatnonzero(kept.numpy())
     position, normal, shading_normal = (
-        vectors.numpy().reshape(size, 3)[chosen]
+        vectors.numpy().reshape(size, 3).take(chosen, axis=0)
         for vectors in (positions, normals, shading_normals)
     )
     return SurfacePoints(

@@ -63,9 +63,11 @@ def solve_irradiance(
     more_rays: int = 0,
     may_divide: bool = False,
     seed: int = 0,
+    members: PatchPoints | None = None,
 ) -> Solution:
     """Gather and solve for the irradiance of every patch.
 
+    ``members`` are the surface points of the mesh, if they have been sorted already.
     ``samples`` rays start from each patch, a power of two, and up to about ``more_rays`` where the
     picture's error hangs on them. If patches turn out to be too large, and ``may_divide``, it ends
     there. With E_d the direct and E_i the indirect irradiance,
@@ -73,7 +75,7 @@ def solve_irradiance(
     end in patch j, the solution fulfils E_i = mean(π b + w E(j)), where E(j) is E_d + E_i or E_i.
     """
     n_patches = mesh.patches.count
-    members = PatchPoints(mesh)
+    members = members or PatchPoints(mesh)
     n_channels, n_used = len(mi.Spectrum()), len(members.patches)
     if n_used == 0:  # Nothing but mirrors and glass.
         table = dr.zeros(mi.Float, 2 * n_patches * n_channels)
