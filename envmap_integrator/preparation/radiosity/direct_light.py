@@ -10,6 +10,7 @@ import numpy as np
 
 from ...lookup.emitter_choice import EmitterChoice, Emitters
 from ...lookup.patches import normal_direction
+from ...system.grouping import grouped
 from ...system.jit import mean_channel, upload, upload_vectors
 from ...system.ray_counts import Ray, count
 from ..coarse_mesh.build import cell_keys
@@ -83,30 +84,33 @@ def choose_emitters(
     n, weights = emitters.count, emitters.weights
     if n < 2:
         return by_weight(emitters)
-    emitter = light.emitter.numpy().astype(np.int64)
-    # The irradiance has been divided by the weights.
-    square = np.square(light.irradiance.numpy().astype(np.float64)) * weights[emitter]
-    if not square.any():
+    irradiance = light.irradiance.numpy()
+    lit = np.flatnonzero(irradiance)
+    if len(lit) == 0:
         return by_weight(emitters)
+    lit_by = light.emitter.numpy()[lit].astype(np.int64)
+    # The irradiance has been divided by the weights.
+    lit_square = np.square(irradiance[lit].astype(np.float64)) * weights[lit_by]
+    of_all = np.bincount(lit_by, lit_square, n)
 
     # ---- Which rays left from each cell ----
-    in_cell = light.members.cells >= 0
-    point = light.members.index[light.members.first[:-1]][in_cell]
-    cells, first, cell = np.unique(
-        light.members.cells[in_cell], return_index=True, return_inverse=True
-    )
-    n_rays = SAMPLES * np.bincount(cell, minlength=len(cells))
-    lit = square.reshape(-1, SAMPLES)[in_cell] > 0
-    cell = np.repeat(cell, lit.sum(axis=1))
-    lit_by = emitter.reshape(-1, SAMPLES)[in_cell][lit]
-    lit_square = square.reshape(-1, SAMPLES)[in_cell][lit]
+    known = np.flatnonzero(light.members.cells >= 0)
+    found = grouped(light.members.cells[known])
+    cells, first = found.keys, known[found.order[found.first[:-1]]]
+    point = light.members.index[light.members.first[first]]
+    n_rays = SAMPLES * found.counts
+    cell = np.full(len(light), -1)
+    cell[known] = found.index
+    cell = cell[lit // SAMPLES]
+    if len(known) < len(light):
+        lit_by, lit_square, cell = (x[cell >= 0] for x in (lit_by, lit_square, cell))
     n_lit = np.bincount(cell, minlength=len(cells))
 
     # ---- A row for the smallest surroundings of each cell that rays enough left from ----
     row = np.full(len(cells), -1)
     rows, n_rows = [], 0
     waiting = np.ones(len(cells), dtype=bool)
-    for group in _surroundings(mesh, point[first]):
+    for group in _surroundings(mesh, point):
         informed = np.bincount(group, n_rays)[group] >= RAYS_PER_EMITTER * n
         new = waiting & informed & (np.bincount(group, n_lit)[group] > 0)
         waiting &= ~informed
@@ -114,15 +118,17 @@ def choose_emitters(
         row[new] = n_rows + place
         rank = np.full(group.max(initial=0) + 1, -1)
         rank[used] = np.arange(len(used))
-        there = rank[group][cell]
-        slot = (there * n + lit_by)[there >= 0]
-        found = np.bincount(slot, lit_square[there >= 0], len(used) * n)
-        rows.append(found.reshape(-1, n))
+        slot = (rank * n)[group][cell] + lit_by
+        there = slot >= 0
+        squares = lit_square
+        if not there.all():
+            slot, squares = slot[there], lit_square[there]
+        rows.append(np.bincount(slot, squares, len(used) * n).reshape(-1, n))
         n_rows += len(used)
         if not waiting.any():
             break
     # The last row is for the rest, and for the empty slots of the cells' hash table.
-    rows.append(np.bincount(emitter, square, n)[None])
+    rows.append(of_all[None])
     row_of_cell = np.full(dr.width(mesh.patches.levels), n_rows)
     row_of_cell[cells] = np.where(row < 0, n_rows, row)
 

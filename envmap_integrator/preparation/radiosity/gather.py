@@ -78,18 +78,19 @@ class Blocks:
 
     rank    [B]  place of a block's patch, in ascending order
     count   [K]  number of blocks
+    one_each     whether each patch has one
     """
 
     def __init__(self, rank: np.ndarray, n_patches: int):
         self.rank = rank
         self.count = np.bincount(rank, minlength=n_patches)
-        self._one_each = len(rank) == n_patches
+        self.one_each = len(rank) == n_patches
         self._first = upload(mi.UInt32, np.cumsum(self.count) - self.count)
         self._count = upload(mi.UInt32, self.count)
 
     def mean(self, values: mi.Spectrum) -> mi.Spectrum:
         """Means [K] over the blocks of each patch, always summed in the same order."""
-        return values if self._one_each else self._mean(dr.ravel(values))
+        return values if self.one_each else self._mean(dr.ravel(values))
 
     @dr.syntax
     def _mean(self, values: mi.Float) -> mi.Spectrum:
