@@ -15,6 +15,7 @@ import numpy as np
 
 from ...lookup.ids import ObjectIds
 from ...system.jit import mean_channel, upload
+from ...system.random_numbers import RandomNumbers
 from ...system.ray_counts import Ray, count
 
 #: Hits followed along each global line, and along each walk from a sensor.
@@ -147,7 +148,8 @@ def diffuse_normal(bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, active: mi.Boo
     cosine-distributed directions.
     """
     normal = mi.Normal3f(si.sh_frame.n)
-    i, pending = mi.UInt32(0), mi.Bool(active)
+    i = mi.UInt32(0)
+    pending = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection)
     while dr.hint(pending, exclude=[bsdf, si], label="Look for the diffuse lobe"):
         lobe = 1 - (mi.Float(i) + 0.5) / LOBES  # The diffuse one comes last in most materials.
         bs, _ = bsdf.sample(mi.BSDFContext(), si, lobe, mi.Point2f(0.5), pending)
@@ -177,16 +179,16 @@ def scatter_points(
     wanted = mi.BSDFFlags.Smooth
     if mirrors:
         wanted = wanted | mi.BSDFFlags.DeltaReflection
-    sampler = mi.load_dict({"type": "independent"})
 
     def walks(n_rays, batch):
         points = []
         for index, sensor in enumerate(sensors):
-            sampler.seed(1009 * (MAX_BATCHES * seed + batch) + index + 1, n_rays)
-            ray = _sensor_rays(sensor, sampler)
+            seed_ = 1009 * (MAX_BATCHES * seed + batch) + index + 1
+            numbers = RandomNumbers.of_lanes(seed_, n_rays)
+            ray = _sensor_rays(sensor, numbers)
             start = _starts(scene, sensor, ray.o, batch)
             points.append(
-                _hits_along(scene, object_ids, sampler, ray, wanted, walk=index + 1, start=start)
+                _hits_along(scene, object_ids, numbers, ray, wanted, walk=index + 1, start=start)
             )
         return points
 
@@ -197,9 +199,9 @@ def scatter_points(
     spheres = _spheres(scene, points)
 
     def lines(n_rays, batch):
-        sampler.seed(1009 * (MAX_BATCHES * seed + batch), n_rays)
-        ray, within = _global_lines(spheres, sampler, n_rays)
-        return [_hits_along(scene, object_ids, sampler, ray, wanted, within=within)]
+        numbers = RandomNumbers.of_lanes(1009 * (MAX_BATCHES * seed + batch), n_rays)
+        ray, within = _global_lines(spheres, numbers, n_rays)
+        return [_hits_along(scene, object_ids, None, ray, wanted, within=within)]
 
     return SurfacePoints.concatenate(points + _enough(lines, count, LINE_HITS))
 
@@ -208,10 +210,9 @@ def walk_from(
     scene: mi.Scene, object_ids: ObjectIds, sensor: mi.Sensor, n_rays: int
 ) -> SurfacePoints:
     """What walks from a sensor meet, as ``scatter_points`` does it."""
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(0, n_rays)
-    ray = _sensor_rays(sensor, sampler)
-    return _hits_along(scene, object_ids, sampler, ray, mi.BSDFFlags.Smooth, walk=1)
+    numbers = RandomNumbers.of_lanes(0, n_rays)
+    ray = _sensor_rays(sensor, numbers)
+    return _hits_along(scene, object_ids, numbers, ray, mi.BSDFFlags.Smooth, walk=1)
 
 
 def _starts(
@@ -283,16 +284,16 @@ def _enough(trace, count: int, n_hits: int) -> list[SurfacePoints]:
     return points
 
 
-def _sensor_rays(sensor: mi.Sensor, sampler: mi.Sampler) -> mi.Ray3f:
-    time = sensor.shutter_open() + sensor.shutter_open_time() * sampler.next_1d()
+def _sensor_rays(sensor: mi.Sensor, numbers: RandomNumbers) -> mi.Ray3f:
+    time = sensor.shutter_open() + sensor.shutter_open_time() * numbers.next_1d()
     ray, _ = sensor.sample_ray_differential(
-        time, sampler.next_1d(), sampler.next_2d(), sampler.next_2d()
+        time, numbers.next_1d(), numbers.next_2d(), numbers.next_2d()
     )
     return mi.Ray3f(ray)
 
 
 def _global_lines(
-    spheres: np.ndarray, sampler: mi.Sampler, n_rays: int
+    spheres: np.ndarray, numbers: RandomNumbers, n_rays: int
 ) -> tuple[mi.Ray3f, mi.Vector4f]:
     """Lines of uniform measure through spheres [V, 4], equally many through each.
 
@@ -300,8 +301,8 @@ def _global_lines(
     """
     lane = dr.arange(mi.UInt32, n_rays) % dr.opaque(mi.UInt32, len(spheres))
     sphere = dr.gather(mi.Vector4f, upload(mi.Float, spheres), lane)
-    direction = mi.warp.square_to_uniform_sphere(sampler.next_2d())
-    disk = mi.warp.square_to_uniform_disk_concentric(sampler.next_2d())
+    direction = mi.warp.square_to_uniform_sphere(numbers.next_2d())
+    disk = mi.warp.square_to_uniform_disk_concentric(numbers.next_2d())
     offset = mi.Frame3f(direction).to_world(mi.Vector3f(disk.x, disk.y, -1.01))
     return mi.Ray3f(mi.Point3f(sphere.xyz) + sphere.w * offset, direction), sphere
 
@@ -310,7 +311,7 @@ def _global_lines(
 def _hits_along(
     scene: mi.Scene,
     object_ids: ObjectIds,
-    sampler: mi.Sampler,
+    numbers: RandomNumbers | None,
     ray: mi.Ray3f,
     wanted: mi.BSDFFlags,
     walk: int = 0,
@@ -329,13 +330,22 @@ def _hits_along(
     kept, turned = dr.zeros(mi.Bool, size), dr.zeros(mi.Bool, size)
     n_hits_, n_rays_ = dr.opaque(mi.UInt32, n_hits), dr.opaque(mi.UInt32, n_rays)
 
-    ray = mi.Ray3f(ray)
+    # Only what changes is part of the loop's state: with more, it would be traced twice.
+    origin, line = mi.Point3f(ray.o), ray.d
+    direction, maxt = (mi.Vector3f(ray.d), mi.Float(ray.maxt)) if walk else (None, None)
+    time, wavelengths = ray.time, ray.wavelengths
     index = dr.arange(mi.UInt32, n_rays)
     active = dr.full(mi.Bool, True, n_rays)
     while dr.hint(
         active,
         exclude=[
             object_ids,
+            within,
+            line,
+            time,
+            wavelengths,
+            n_hits_,
+            n_rays_,
             positions,
             normals,
             shading_normals,
@@ -347,11 +357,14 @@ def _hits_along(
         ],
         label="Scatter points",
     ):
-        count(Ray.SURVEY, ray, active)
-        si = scene.ray_intersect(ray, active)
+        towards = direction if walk else line
+        reach = maxt if walk else dr.largest(mi.Float)
+        sent = mi.Ray3f(origin, towards, reach, time, wavelengths)
+        count(Ray.SURVEY, sent, active)
+        si = scene.ray_intersect(sent, active)
         active &= si.is_valid()
         bsdf = si.bsdf()
-        facing = dr.dot(si.n, ray.d) < 0
+        facing = dr.dot(si.n, towards) < 0
         normal = dr.select(facing, si.n, -si.n)
         shading_normal = diffuse_normal(bsdf, si, active)
         shading_normal = dr.mulsign(shading_normal, dr.dot(shading_normal, normal))
@@ -370,15 +383,15 @@ def _hits_along(
         aligned = dr.abs(dr.dot(shading_normal, si.sh_frame.n))
         dr.scatter(turned, aligned < UNTURNED, index, keep)
 
-        direction = ray.d
         if dr.hint(walk > 0, mode="scalar"):
             bs, weight = bsdf.sample(
-                mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active
+                mi.BSDFContext(), si, numbers.next_1d(), numbers.next_2d(), active
             )
-            direction = si.to_world(bs.wo)
+            direction = towards = si.to_world(bs.wo)
+            maxt = mi.Float(dr.largest(mi.Float))
             dr.scatter(reflects, mean_channel(weight), index, keep)
             active &= mi.luminance(weight) > 0 if len(weight) == 3 else weight[0] > 0
-        ray = si.spawn_ray(direction)
+        origin = mi.Point3f(si.spawn_ray(towards).o)
         index += n_rays_
         active &= index < n_hits_ * n_rays_
 

@@ -12,6 +12,7 @@ from ...lookup.emitter_choice import EmitterChoice, Emitters
 from ...lookup.patches import normal_direction
 from ...system.grouping import grouped
 from ...system.jit import mean_channel, upload, upload_vectors
+from ...system.random_numbers import RandomNumbers
 from ...system.ray_counts import Ray, count
 from ..coarse_mesh.build import cell_keys
 from ..coarse_mesh.mesh import CoarseMesh
@@ -57,12 +58,15 @@ def survey_direct_light(
     n = len(members.patches) * SAMPLES
     if n == 0:
         return DirectLight(members, mi.Float(), mi.UInt32(), mi.Point3f())
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(seed, n)
-    point = members.sample(dr.arange(mi.UInt32, n) // SAMPLES, sampler.next_1d())
+    numbers = RandomNumbers.of_lanes(seed, n)
+    lane = dr.arange(mi.UInt32, n)
+    point = members.sample(lane // SAMPLES, numbers.next_1d())
     si = mesh.points.interaction(point)
     choice = by_weight(emitters)
-    ds, light = sample_irradiance(scene, choice, si, mi.UInt32(0), sampler.next_2d())
+    # In strata: neighbours send their rays to the same emitter, which is faster.
+    u = numbers.next_2d()
+    u.x = (mi.Float(lane % SAMPLES) + u.x) / SAMPLES
+    ds, light = sample_irradiance(scene, choice, si, mi.UInt32(0), u)
     irradiance = finite(mean_channel(light))
     emitter = emitters.index(ds.emitter, irradiance > 0)
     dr.eval(irradiance, emitter, si.p)

@@ -16,6 +16,7 @@ from ...lookup.lookup import Lookup
 from ...lookup.patches import PARTS
 from ...system.jit import R2, mean_channel, mix, unit, upload
 from ...system.progress import stage
+from ...system.random_numbers import RandomNumbers
 from ...transport.direct_light import mis_weight
 from ...transport.path import follow
 from ...transport.rules import PathRules
@@ -136,13 +137,12 @@ def block_mean(value: mi.Spectrum | mi.Float, samples: int) -> mi.Spectrum | mi.
 
 def _gather(scene, lookup, members, incidence, rank, samples, seed) -> GatherRays:
     n_lanes = len(rank) * samples
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(seed, n_lanes)
+    numbers = RandomNumbers.of_lanes(seed, n_lanes)
     lane = dr.arange(mi.UInt32, n_lanes)
     block = lane >> dr.opaque(mi.UInt32, int(np.log2(samples)))
     member = dr.gather(mi.UInt32, upload(mi.UInt32, rank), block)
     k = lane & (dr.opaque(mi.UInt32, samples) - 1)
-    point = members.sample(member, sampler.next_1d())
+    point = members.sample(member, numbers.next_1d())
     si = members.points.interaction(point)
     patch = dr.gather(mi.UInt32, upload(mi.UInt32, members.patches), member)
     start_place = PARTS * patch + dr.gather(mi.UInt32, members.parts, point)
@@ -176,7 +176,7 @@ def _gather(scene, lookup, members, incidence, rank, samples, seed) -> GatherRay
         specular=mi.Bool(False),
     )
     above = (dr.dot(si.n, direction) > 0) & (wo.z > 0)
-    end_ = follow(scene, lookup, PathRules(), sampler, start, above)
+    end_ = follow(scene, lookup, PathRules(), numbers, start, above)
     counts = incidence(point, wo.z)
     direct += dr.pi * counts * end_.direct
     escaped = dr.pi * counts * (end_.radiance - end_.direct)

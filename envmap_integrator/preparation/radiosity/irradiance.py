@@ -170,7 +170,7 @@ def _all_bounces(bounce, light: mi.Float, scale: mi.Float) -> mi.Float:
 
     system = LinearOperator((n, n), remaining, dtype=np.float64)
     found, unsolved = gmres(
-        system, light / scale, rtol=0, atol=TOLERANCE * np.sqrt(n), restart=KRYLOV, maxiter=2
+        system, light / scale, rtol=0, atol=TOLERANCE * np.sqrt(n), restart=KRYLOV, maxiter=4
     )
     if unsolved or np.any(scale * found < 0.99 * light):
         found = light / scale
