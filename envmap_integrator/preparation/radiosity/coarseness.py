@@ -191,6 +191,4 @@ def _exact_sums(*wanted: tuple[mi.Float, mi.UInt32, int, float]) -> list[np.ndar
         number = mi.Int64(mi.Float64(values) * dr.opaque(mi.Float64, scale))
         dr.scatter_add(sum_, mi.UInt64(number), index, mode=dr.ReduceMode.Direct)
     dr.eval(sums)
-    return [
-        sum_.numpy().view(np.int64) / scale for sum_, scale in zip(sums, scales, strict=True)
-    ]
+    return [sum_.numpy().view(np.int64) / scale for sum_, scale in zip(sums, scales, strict=True)]

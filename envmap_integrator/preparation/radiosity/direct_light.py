@@ -88,13 +88,16 @@ def choose_emitters(
     n, weights = emitters.count, emitters.weights
     if n < 2:
         return by_weight(emitters)
-    irradiance = light.irradiance.numpy()
-    lit = np.flatnonzero(irradiance)
+    lit = dr.compress(light.irradiance != 0)
     if len(lit) == 0:
         return by_weight(emitters)
-    lit_by = light.emitter.numpy()[lit].astype(np.int64)
+    lit_by = dr.gather(mi.UInt32, light.emitter, lit)
+    lit_square = dr.square(mi.Float64(dr.gather(mi.Float, light.irradiance, lit)))
+    of_patch = lit // SAMPLES
+    dr.eval(lit_by, lit_square, of_patch)
+    lit_by = lit_by.numpy().astype(np.int64)
     # The irradiance has been divided by the weights.
-    lit_square = np.square(irradiance[lit].astype(np.float64)) * weights[lit_by]
+    lit_square = lit_square.numpy() * weights[lit_by]
     of_all = np.bincount(lit_by, lit_square, n)
 
     # ---- Which rays left from each cell ----
@@ -105,7 +108,7 @@ def choose_emitters(
     n_rays = SAMPLES * found.counts
     cell = np.full(len(light), -1)
     cell[known] = found.index
-    cell = cell[lit // SAMPLES]
+    cell = cell[of_patch.numpy()]
     if len(known) < len(light):
         lit_by, lit_square, cell = (x[cell >= 0] for x in (lit_by, lit_square, cell))
     n_lit = np.bincount(cell, minlength=len(cells))

@@ -112,8 +112,7 @@ def cache_noise(
     sums += sources * sources, others * others, 2 * sources * others
     *means, escaped, patched, s_s, o_o, s_o = _block_sums(sums, samples)
     block = sum(
-        importance * mean[:, None] / samples
-        for importance, mean in zip((t, i), means, strict=True)
+        importance * mean[:, None] / samples for importance, mean in zip((t, i), means, strict=True)
     )
     moments = [0.5 / samples**2 * x for x in (s_s, o_o, s_o)]
     within = sum(
