@@ -92,6 +92,7 @@ def prepare(
                 settings.patch_samples,
                 settings.more_rays,
                 may_divide=divisions < MOST_DIVISIONS,
+                members=light.members.only(mesh),
             )
         if not solution.steep.any():
             break

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -25,11 +24,13 @@ def upload(dtype: type, values: np.ndarray) -> mi.Float | mi.UInt32:
     Dr.Jit maps NumPy's memory as it is. Where that isn't aligned, which is a matter of chance,
     packed gathers fall apart into scalar ones and every kernel is compiled again.
     """
-    values = np.asarray(values, dtype=np.float32 if dr.is_float_v(dtype) else np.uint32).ravel()
-    memory = np.empty(values.nbytes + _ALIGNMENT, dtype=np.uint8)
+    values = np.asarray(values)
+    own = np.dtype(np.float32 if dr.is_float_v(dtype) else np.uint32)
+    n_bytes = own.itemsize * values.size
+    memory = np.empty(n_bytes + _ALIGNMENT, dtype=np.uint8)
     begin = -memory.ctypes.data % _ALIGNMENT
-    aligned = memory[begin : begin + values.nbytes].view(values.dtype)
-    aligned[:] = values
+    aligned = memory[begin : begin + n_bytes].view(own)
+    np.copyto(aligned.reshape(values.shape), values, casting="unsafe")
     return dtype(aligned)
 
 
@@ -65,29 +66,6 @@ def mix(h: mi.UInt32) -> mi.UInt32:
 def unit(bits: mi.UInt32) -> mi.Float:
     """A number in [0, 1) from the upper bits of a random integer."""
     return mi.Float(bits >> 8) / 16777216.0
-
-
-@dataclass
-class KeyedNumbers:
-    """Independent random numbers by key, not by lane, as Mitsuba's samplers give them."""
-
-    generator: mi.PCG32
-
-    @classmethod
-    def of(cls, seed: int, key: mi.UInt32, number: mi.UInt32) -> KeyedNumbers:
-        """A sequence for each key and number; the same for the same seed."""
-        state, stream = mi.sample_tea_32(key ^ dr.opaque(mi.UInt32, seed), number)
-        generator = mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(stream))
-        return cls(generator)
-
-    def next_1d(self, active: mi.Bool | bool = True) -> mi.Float:
-        """A number in [0, 1)."""
-        return mi.Float(self.generator.next_float32(active))
-
-    def next_2d(self, active: mi.Bool | bool = True) -> mi.Point2f:
-        """A point in the unit square."""
-        x = self.next_1d(active)
-        return mi.Point2f(x, self.next_1d(active))
 
 
 class SpareNumbers:

@@ -148,6 +148,22 @@ def test_a_sheet_under_a_point_light():
     assert (np.abs(light.total[:, 0] - mean) <= (QUANTILE + 1) * error + 1e-4 * mean).all()
 
 
+def test_points_of_fewer_patches():
+    """What is sorted for all patches of a mesh needn't be sorted again for some of them."""
+    coarse = coarse_mesh(scene_of(box(1) | grey(0.5)), BUDGET)
+    dropped = np.arange(coarse.patches.count) % 3 == 0
+    mesh_ = coarse.without(dropped)
+    ours, expected = PatchPoints(coarse).only(mesh_), PatchPoints(mesh_)
+    assert 0 < len(ours.patches) < coarse.n_used
+    for name in ("patches", "first", "index", "cells", "rank_of_patch"):
+        np.testing.assert_array_equal(getattr(ours, name), getattr(expected, name))
+    rank = dr.arange(mi.UInt32, 999) % len(ours.patches)
+    sampled = [
+        m.sample(rank, dr.linspace(mi.Float, 0, 0.999, 999)).numpy() for m in (ours, expected)
+    ]
+    np.testing.assert_array_equal(*sampled)
+
+
 def test_light_between_two_sheets():
     """The lower one is lit by a spot, the upper one only by what comes off it.
 

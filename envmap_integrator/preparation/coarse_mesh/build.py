@@ -10,6 +10,7 @@ import numpy as np
 
 from ...lookup.ids import ObjectIds
 from ...lookup.patches import BUCKET, LEVEL_BITS, MARK_BITS, Patches, cell_hash
+from ...system.grouping import grouped
 from ...system.jit import opaque_point, upload
 from .mesh import CoarseMesh
 from .surface_points import SurfacePoints
@@ -47,11 +48,12 @@ def build_mesh(
         )
         identity = patches.identity_of(normal, object_id)
         key = cell_keys(patches, position, identity, mi.UInt32(0))
-        large, cell_of_point, n_points = np.unique(key, return_inverse=True, return_counts=True)
+        large = grouped(key)
         # Six directions of a hundred small objects may share the smallest grid there is.
-        if len(large) <= max(budget // 2, 8) or size > 4 * extent:
+        if len(large.keys) <= max(budget // 2, 8) or size > 4 * extent:
             break
         size *= 2
+    n_points, cell_of_point = large.counts, large.index
 
     # ---- Large cells choose their level by how densely points lie in them ----
     n_patches = np.maximum(n_points * (budget / len(points)), 1)
@@ -59,7 +61,7 @@ def build_mesh(
     edge = np.maximum(np.sqrt(long * short / n_patches), long / n_patches)
     level = np.round(-np.log2(np.clip(edge, 2.0**-MAX_LEVEL, 1)))
     payload = np.uint64((1 << LEVEL_BITS) - 1)
-    levels, index_of_large = _hash_table(large & ~payload)
+    levels, index_of_large = _hash_table(large.keys & ~payload)
     kept = index_of_large >= 0
     if divided is not None:
         level[kept] += divided[index_of_large[kept]]
@@ -70,11 +72,11 @@ def build_mesh(
     # ---- Their cells are the patches ----
     level_of_point = upload(mi.UInt32, level[cell_of_point])
     key = cell_keys(patches, position, identity, level_of_point)
-    cells, cell_of_point = np.unique(key, return_inverse=True)
-    cells, patch_of_cell = _hash_table(cells & ~np.uint64((1 << MARK_BITS) - 1))
+    small = grouped(key)
+    cells, patch_of_cell = _hash_table(small.keys & ~np.uint64((1 << MARK_BITS) - 1))
     patches = replace(patches, levels=upload(mi.UInt32, levels), cells=upload(mi.UInt32, cells))
     space = np.zeros(len(points), dtype=np.int64)
-    return CoarseMesh(points, patches, patch_of_cell[cell_of_point], large_of_point, space)
+    return CoarseMesh(points, patches, patch_of_cell[small.index], large_of_point, space)
 
 
 def _filled(position, cell_of_point, n_points, size) -> np.ndarray:
@@ -111,7 +113,7 @@ def cell_keys(
     scale = mi.Float(mi.UInt32(1) << level) / patches.size
     cell = mi.Vector3i(dr.floor((position - patches.origin) * scale))
     slot, fingerprint = cell_hash(cell, identity, level)
-    return (slot.numpy().astype(np.uint64) << np.uint64(32)) | fingerprint.numpy()
+    return ((mi.UInt64(slot) << 32) | mi.UInt64(fingerprint)).numpy()
 
 
 def _hash_table(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

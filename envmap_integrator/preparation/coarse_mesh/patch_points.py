@@ -8,9 +8,9 @@ from functools import cached_property
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.sparse import coo_matrix
 
 from ...lookup.patches import MARK_BITS, PARTS
+from ...system.grouping import grouped
 from ...system.jit import upload
 from .mesh import CoarseMesh
 
@@ -32,26 +32,37 @@ class PatchPoints:
     """
 
     def __init__(self, mesh: CoarseMesh):
-        points, patch_of_point = mesh.points, mesh.patch_of_point
-        standing = np.flatnonzero(patch_of_point >= 0)
-        # Rows of a sparse matrix: a counting sort.
-        place = patch_of_point[standing], np.arange(len(standing))
-        by_patch = coo_matrix((standing, place), (mesh.patches.count, len(standing))).tocsr()
-        self.patches = np.flatnonzero(np.diff(by_patch.indptr))
-        self.first = np.append(by_patch.indptr[self.patches], len(standing)).astype(np.uint32)
-        self.keys = mesh.patches.cells.numpy()[self.patches] >> np.uint32(MARK_BITS)
-        self.points = points
-        self._mesh = mesh
+        standing = np.flatnonzero(mesh.patch_of_point >= 0)
+        by_patch = grouped(mesh.patch_of_point[standing])
+        index = standing[by_patch.order]
+        position = mesh.points.position.take(index, axis=0)
+        by_part = grouped(_parts(position, by_patch.first))
+        n_parts = np.bincount(by_part.keys // STRATA**3, minlength=len(by_patch.keys))
+        self._set(mesh, by_patch.keys, index[by_part.order], n_parts, by_part.counts)
+
+    def _set(self, mesh, patches, index, n_parts, n_points) -> None:
+        """``n_parts`` [K] of each patch hold points, ``n_points`` of them each."""
+        self._mesh, self.points = mesh, mesh.points
         self.n_cells = dr.width(mesh.patches.levels)
-        key = self._parts(points.position[by_patch.data])
-        order = np.argsort(key, kind="stable")
-        self.index = by_patch.data[order]
-        self.cells = mesh.cell_of_point[self.index[self.first[:-1]]]
-        part, first_of_part = np.unique(key[order], return_index=True)
-        first_part = np.searchsorted(part, STRATA**3 * np.arange(len(self.patches) + 1))
+        self.patches, self.index = patches, index
+        self.keys = mesh.patches.cells.numpy()[patches] >> np.uint32(MARK_BITS)
+        self._n_parts, self._n_points = n_parts, n_points
+        first_part, first_of_part = (np.append(0, np.cumsum(n)) for n in (n_parts, n_points))
+        self.first = first_of_part[first_part].astype(np.uint32)
+        self.cells = mesh.cell_of_point[index[self.first[:-1]]]
         self._first_part = upload(mi.UInt32, first_part)
-        self._first_of_part = upload(mi.UInt32, np.append(first_of_part, len(key)))
-        self._index = upload(mi.UInt32, self.index)
+        self._first_of_part = upload(mi.UInt32, first_of_part)
+        self._index = upload(mi.UInt32, index)
+
+    def only(self, mesh: CoarseMesh) -> PatchPoints:
+        """Those of the same mesh from which some patches have been dropped since."""
+        kept = mesh.patch_of_point[self.index[self.first[:-1]]] >= 0
+        part_kept = np.repeat(kept, self._n_parts)
+        n_points = self._n_points[part_kept]
+        index = self.index[np.repeat(part_kept, self._n_points)]
+        fewer = PatchPoints.__new__(PatchPoints)
+        fewer._set(mesh, self.patches[kept], index, self._n_parts[kept], n_points)
+        return fewer
 
     @cached_property
     def parts(self) -> mi.UInt32:
@@ -67,19 +78,6 @@ class PatchPoints:
         rank[self.patches] = np.arange(len(self.patches))
         return rank
 
-    def _parts(self, position: np.ndarray) -> np.ndarray:
-        """Number of the part of a patch in which each point lies, ascending from patch to patch."""
-        first = self.first[:-1].astype(np.int64)
-        key = np.repeat(np.arange(len(first)), np.diff(self.first.astype(np.int64)))
-        if len(first) == 0:
-            return key
-        rank = key
-        for x in position.T.astype(np.float64):
-            low, high = (f.reduceat(x, first)[rank] for f in (np.minimum, np.maximum))
-            slice_ = (x - low) * (STRATA / np.maximum(high - low, np.finfo(np.float32).tiny))
-            key = STRATA * key + np.minimum(slice_.astype(np.int64), STRATA - 1)
-        return key
-
     def sample(self, rank: mi.UInt32, u: mi.Float) -> mi.UInt32:
         """Index of a random surface point of the ``rank``-th patch.
 
@@ -89,6 +87,23 @@ class PatchPoints:
         part, u = _among(self._first_part, rank, u)
         k, _ = _among(self._first_of_part, part, u)
         return dr.gather(mi.UInt32, self._index, k)
+
+
+def _parts(position: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Number of the part of a patch in which each point [N] lies, ascending from patch to patch.
+
+    The points are sorted by patch; ``first`` [K + 1] is where those of each begin.
+    """
+    rank = np.repeat(np.arange(len(first) - 1), np.diff(first))
+    key = rank
+    if len(key) == 0:
+        return key
+    for x in position.T.astype(np.float64):
+        low, high = (f.reduceat(x, first[:-1]) for f in (np.minimum, np.maximum))
+        scale = STRATA / np.maximum(high - low, np.finfo(np.float32).tiny)
+        slice_ = (x - low[rank]) * scale[rank]
+        key = STRATA * key + np.minimum(slice_.astype(np.int64), STRATA - 1)
+    return key
 
 
 def _among(first: mi.UInt32, group: mi.UInt32, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:

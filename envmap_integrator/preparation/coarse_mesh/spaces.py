@@ -14,7 +14,9 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from ...lookup.ids import ObjectIds
+from ...system.grouping import grouped
 from ...system.jit import upload
+from ...system.random_numbers import RandomNumbers
 from ...system.ray_counts import Ray, count
 from .mesh import CoarseMesh
 from .surface_points import SurfacePoints
@@ -46,7 +48,7 @@ def find_spaces(scene: mi.Scene, mesh: CoarseMesh, seed: int = 0) -> CoarseMesh:
     walk = points.seen.astype(np.int64)
     if points.start.any():
         starts = walk[walked] * (points.start.max() + 1) + points.start[walked]
-        walk[walked] = 1 + np.unique(starts, return_inverse=True)[1]
+        walk[walked] = 1 + grouped(starts).index
     space = np.where(walk > 0, 0, -1)
     sight = _Sight(scene, points)
     if walk.max() > 1:
@@ -87,21 +89,20 @@ class _Sight:
 
         Takes and returns indices, a point's own where it saw none.
         """
-        sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(seed, len(points))
+        numbers = RandomNumbers.of_lanes(seed, len(points))
         return _first_seen(
-            self, upload(mi.UInt32, points), upload(mi.UInt32, targets), len(targets), sampler
+            self, upload(mi.UInt32, points), upload(mi.UInt32, targets), len(targets), numbers
         ).numpy()
 
 
 @dr.syntax
-def _first_seen(sight, point, targets, n_targets, sampler):
+def _first_seen(sight, point, targets, n_targets, numbers):
     seen = mi.UInt32(point)
     n = dr.opaque(mi.UInt32, n_targets)
     tries = mi.UInt32(0)
-    active = mi.Bool(True)
-    while dr.hint(active, exclude=[sight, targets], label="Look for points on walks"):
-        k = dr.minimum(mi.UInt32(sampler.next_1d() * mi.Float(n)), n - 1)
+    active = dr.full(mi.Bool, True, dr.width(point))
+    while dr.hint(active, exclude=[sight, point, targets, n], label="Look for points on walks"):
+        k = dr.minimum(mi.UInt32(numbers.next_1d() * mi.Float(n)), n - 1)
         target = dr.gather(mi.UInt32, targets, k, active)
         found = sight(point, target, active)
         seen = dr.select(found, target, seen)
@@ -136,9 +137,9 @@ def separate(scene: mi.Scene, object_ids: ObjectIds, mesh: CoarseMesh, seed: int
     return replace(mesh.without(dropped), cell_of_point=cell_of_point)
 
 
-def _looked_at(scene, object_ids, patches, si, space_of_patch, sampler, active) -> mi.UInt32:
+def _looked_at(scene, object_ids, patches, si, space_of_patch, numbers, active) -> mi.UInt32:
     """The space of the patch that a random ray from each point hits, ``UNKNOWN`` if none."""
-    direction = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
+    direction = mi.warp.square_to_cosine_hemisphere(numbers.next_2d())
     ray = si.spawn_ray(mi.Frame3f(si.n).to_world(direction))
     count(Ray.SURVEY, ray, active)
     hit = scene.ray_intersect(ray, active)
@@ -156,8 +157,7 @@ def _look_around(scene, object_ids, mesh, space_of_patch, seed):
     """
     points, patches, space = mesh.points, mesh.patches, mesh.space_of_point
     n_lanes = LOOKS * len(points)
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(seed, n_lanes)
+    numbers = RandomNumbers.of_lanes(seed, n_lanes)
     lane = dr.arange(mi.UInt32, n_lanes) // LOOKS
     space_of_patch = upload(mi.UInt32, space_of_patch)
     si = points.interaction(lane)
@@ -165,17 +165,17 @@ def _look_around(scene, object_ids, mesh, space_of_patch, seed):
 
     # ---- Where no walk came, a point is in the space of what it looks at ----
     own = dr.gather(mi.UInt32, upload(mi.UInt32, space), lane)
-    seen = _looked_at(scene, object_ids, patches, si, space_of_patch, sampler, own == UNKNOWN)
+    seen = _looked_at(scene, object_ids, patches, si, space_of_patch, numbers, own == UNKNOWN)
     own = dr.select(own == UNKNOWN, seen, own)
     known = own != UNKNOWN
 
     # ---- Twice as far as the renderer jitters its look-ups, to be on the safe side ----
     near = patches.locate(si.p, si.n, object_id, known)
-    u = sampler.next_2d()
+    u = numbers.next_2d()
     frame = mi.Frame3f(si.n)
     p = si.p + near.patch_size * (frame.s * (u.x - 0.5) + frame.t * (u.y - 0.5))
     cell = patches.locate(p, si.n, object_id, near.found)
-    patch = patches.find(p, si.n, object_id, cell, u=sampler.next_2d())
+    patch = patches.find(p, si.n, object_id, cell, u=numbers.next_2d())
 
     other = dr.gather(mi.UInt32, space_of_patch, patch.index, patch.found) != own
     foreign = dr.zeros(mi.Bool, patches.count)

@@ -15,7 +15,8 @@ import mitsuba as mi
 import numpy as np
 
 from ...lookup.ids import ObjectIds
-from ...system.jit import mean_channel, upload, upload_vectors
+from ...system.jit import mean_channel, upload
+from ...system.random_numbers import RandomNumbers
 from ...system.ray_counts import Ray, count
 from ...system.spectrum import random_wavelengths
 
@@ -122,11 +123,19 @@ class SurfacePoints:
 
     def places(self) -> tuple[mi.Point3f, mi.Normal3f, mi.UInt32]:
         """All points as kernels look them up in a coarse mesh: position, normal and object id."""
-        return (
-            upload_vectors(mi.Point3f, self.position),
-            upload_vectors(mi.Normal3f, self.normal),
-            upload(mi.UInt32, self.object_id),
-        )
+        position, normal, object_id = self._places
+        return mi.Point3f(position), mi.Normal3f(normal), mi.UInt32(object_id)
+
+    @cached_property
+    def _places(self):
+        position, normal, _ = self._vectors
+        places = dr.unravel(mi.Point3f, position), dr.unravel(mi.Normal3f, normal)
+        dr.eval(places)
+        return *places, upload(mi.UInt32, self.object_id)
+
+    def sensors(self, among: np.ndarray | slice = np.s_[:]) -> np.ndarray:
+        """Values that ``seen`` has for points on walks ``among`` some of the points."""
+        return 1 + np.flatnonzero(np.bincount(self.seen[among].astype(np.int64))[1:])
 
     def take(self, index: np.ndarray) -> SurfacePoints:
         """The points of the given indices, in that order, or those of a mask."""
@@ -151,7 +160,8 @@ def diffuse_normal(bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, active: mi.Boo
     cosine-distributed directions.
     """
     normal = mi.Normal3f(si.sh_frame.n)
-    i, pending = mi.UInt32(0), mi.Bool(active)
+    i = mi.UInt32(0)
+    pending = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection)
     while dr.hint(pending, exclude=[bsdf, si], label="Look for the diffuse lobe"):
         lobe = 1 - (mi.Float(i) + 0.5) / LOBES  # The diffuse one comes last in most materials.
         bs, _ = bsdf.sample(mi.BSDFContext(), si, lobe, mi.Point2f(0.5), pending)
@@ -181,16 +191,16 @@ def scatter_points(
     wanted = mi.BSDFFlags.Smooth
     if mirrors:
         wanted = wanted | mi.BSDFFlags.DeltaReflection
-    sampler = mi.load_dict({"type": "independent"})
 
     def walks(n_rays, batch):
         points = []
         for index, sensor in enumerate(sensors):
-            sampler.seed(1009 * (MAX_BATCHES * seed + batch) + index + 1, n_rays)
-            ray = _sensor_rays(sensor, sampler)
+            seed_ = 1009 * (MAX_BATCHES * seed + batch) + index + 1
+            numbers = RandomNumbers.of_lanes(seed_, n_rays)
+            ray = _sensor_rays(sensor, numbers)
             start = _starts(scene, sensor, ray.o, batch)
             points.append(
-                _hits_along(scene, object_ids, sampler, ray, wanted, walk=index + 1, start=start)
+                _hits_along(scene, object_ids, numbers, ray, wanted, walk=index + 1, start=start)
             )
         return points
 
@@ -201,9 +211,9 @@ def scatter_points(
     spheres = _spheres(scene, points)
 
     def lines(n_rays, batch):
-        sampler.seed(1009 * (MAX_BATCHES * seed + batch), n_rays)
-        ray, within = _global_lines(spheres, sampler, n_rays)
-        return [_hits_along(scene, object_ids, sampler, ray, wanted, within=within)]
+        numbers = RandomNumbers.of_lanes(1009 * (MAX_BATCHES * seed + batch), n_rays)
+        ray, within = _global_lines(spheres, numbers, n_rays)
+        return [_hits_along(scene, object_ids, None, ray, wanted, within=within)]
 
     return SurfacePoints.concatenate(points + _enough(lines, count, LINE_HITS))
 
@@ -212,10 +222,9 @@ def walk_from(
     scene: mi.Scene, object_ids: ObjectIds, sensor: mi.Sensor, n_rays: int
 ) -> SurfacePoints:
     """What walks from a sensor meet, as ``scatter_points`` does it."""
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(0, n_rays)
-    ray = _sensor_rays(sensor, sampler)
-    return _hits_along(scene, object_ids, sampler, ray, mi.BSDFFlags.Smooth, walk=1)
+    numbers = RandomNumbers.of_lanes(0, n_rays)
+    ray = _sensor_rays(sensor, numbers)
+    return _hits_along(scene, object_ids, numbers, ray, mi.BSDFFlags.Smooth, walk=1)
 
 
 def _starts(
@@ -252,7 +261,7 @@ def _spheres(scene: mi.Scene, walks: list[SurfacePoints]) -> np.ndarray:
     """
     spheres = []
     points = SurfacePoints.concatenate(walks) if walks else None
-    for number in np.unique(points.seen) if points else ():
+    for number in points.sensors() if points else ():
         spheres.append(_around(points.position[points.seen == number]))
     if not spheres:
         sphere = scene.bbox().bounding_sphere()
@@ -305,16 +314,16 @@ def _enough(trace, count: int, n_hits: int) -> list[SurfacePoints]:
     return points
 
 
-def _sensor_rays(sensor: mi.Sensor, sampler: mi.Sampler) -> mi.Ray3f:
-    time = sensor.shutter_open() + sensor.shutter_open_time() * sampler.next_1d()
+def _sensor_rays(sensor: mi.Sensor, numbers: RandomNumbers) -> mi.Ray3f:
+    time = sensor.shutter_open() + sensor.shutter_open_time() * numbers.next_1d()
     ray, _ = sensor.sample_ray_differential(
-        time, sampler.next_1d(), sampler.next_2d(), sampler.next_2d()
+        time, numbers.next_1d(), numbers.next_2d(), numbers.next_2d()
     )
     return mi.Ray3f(ray)
 
 
 def _global_lines(
-    spheres: np.ndarray, sampler: mi.Sampler, n_rays: int
+    spheres: np.ndarray, numbers: RandomNumbers, n_rays: int
 ) -> tuple[mi.Ray3f, mi.Vector4f]:
     """Lines of uniform measure through spheres [V, 4], equally many through each.
 
@@ -322,10 +331,10 @@ def _global_lines(
     """
     lane = dr.arange(mi.UInt32, n_rays) % dr.opaque(mi.UInt32, len(spheres))
     sphere = dr.gather(mi.Vector4f, upload(mi.Float, spheres), lane)
-    direction = mi.warp.square_to_uniform_sphere(sampler.next_2d())
-    disk = mi.warp.square_to_uniform_disk_concentric(sampler.next_2d())
+    direction = mi.warp.square_to_uniform_sphere(numbers.next_2d())
+    disk = mi.warp.square_to_uniform_disk_concentric(numbers.next_2d())
     offset = mi.Frame3f(direction).to_world(mi.Vector3f(disk.x, disk.y, -1.01))
-    origin, wavelengths = mi.Point3f(sphere.xyz) + sphere.w * offset, random_wavelengths(sampler)
+    origin, wavelengths = mi.Point3f(sphere.xyz) + sphere.w * offset, random_wavelengths(numbers)
     return mi.Ray3f(origin, direction, wavelengths=wavelengths), sphere
 
 
@@ -333,7 +342,7 @@ def _global_lines(
 def _hits_along(
     scene: mi.Scene,
     object_ids: ObjectIds,
-    sampler: mi.Sampler,
+    numbers: RandomNumbers | None,
     ray: mi.Ray3f,
     wanted: mi.BSDFFlags,
     walk: int = 0,
@@ -352,13 +361,22 @@ def _hits_along(
     kept, turned = dr.zeros(mi.Bool, size), dr.zeros(mi.Bool, size)
     n_hits_, n_rays_ = dr.opaque(mi.UInt32, n_hits), dr.opaque(mi.UInt32, n_rays)
 
-    ray = mi.Ray3f(ray)
+    # Only what changes is part of the loop's state: with more, it would be traced twice.
+    origin, line = mi.Point3f(ray.o), ray.d
+    direction, maxt = (mi.Vector3f(ray.d), mi.Float(ray.maxt)) if walk else (None, None)
+    time, wavelengths = ray.time, ray.wavelengths
     index = dr.arange(mi.UInt32, n_rays)
     active = dr.full(mi.Bool, True, n_rays)
     while dr.hint(
         active,
         exclude=[
             object_ids,
+            within,
+            line,
+            time,
+            wavelengths,
+            n_hits_,
+            n_rays_,
             positions,
             normals,
             shading_normals,
@@ -370,11 +388,14 @@ def _hits_along(
         ],
         label="Scatter points",
     ):
-        count(Ray.SURVEY, ray, active)
-        si = scene.ray_intersect(ray, active)
+        towards = direction if walk else line
+        reach = maxt if walk else dr.largest(mi.Float)
+        sent = mi.Ray3f(origin, towards, reach, time, wavelengths)
+        count(Ray.SURVEY, sent, active)
+        si = scene.ray_intersect(sent, active)
         active &= si.is_valid()
         bsdf = si.bsdf()
-        facing = dr.dot(si.n, ray.d) < 0
+        facing = dr.dot(si.n, towards) < 0
         normal = dr.select(facing, si.n, -si.n)
         shading_normal = diffuse_normal(bsdf, si, active)
         shading_normal = dr.mulsign(shading_normal, dr.dot(shading_normal, normal))
@@ -393,15 +414,15 @@ def _hits_along(
         aligned = dr.abs(dr.dot(shading_normal, si.sh_frame.n))
         dr.scatter(turned, aligned < UNTURNED, index, keep)
 
-        direction = ray.d
         if dr.hint(walk > 0, mode="scalar"):
             bs, weight = bsdf.sample(
-                mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), active
+                mi.BSDFContext(), si, numbers.next_1d(), numbers.next_2d(), active
             )
-            direction = si.to_world(bs.wo)
+            direction = towards = si.to_world(bs.wo)
+            maxt = mi.Float(dr.largest(mi.Float))
             dr.scatter(reflects, mean_channel(weight), index, keep)
             active &= mi.luminance(weight) > 0 if mi.is_rgb else dr.max(weight) > 0
-        ray = si.spawn_ray(direction)
+        origin = mi.Point3f(si.spawn_ray(towards).o)
         index += n_rays_
         active &= index < n_hits_ * n_rays_
 
@@ -409,7 +430,7 @@ def _hits_along(
     dr.eval(kept, turned, reflects)
     chosen = np.flatnonzero(kept.numpy())
     position, normal, shading_normal = (
-        vectors.numpy().reshape(size, 3)[chosen]
+        vectors.numpy().reshape(size, 3).take(chosen, axis=0)
         for vectors in (positions, normals, shading_normals)
     )
     return SurfacePoints(

@@ -52,7 +52,7 @@ def usual_service(mesh: CoarseMesh) -> Service:
     points, later = mesh.points, mesh.points.bounce > 0
     each = [
         _service(mesh.patch_of_point[later & (points.seen == sensor)])
-        for sensor in np.unique(points.seen[later & (points.seen > 0)])
+        for sensor in points.sensors(later)
     ]
     if not each:
         return UNKNOWN
@@ -75,6 +75,6 @@ def _service(patch: np.ndarray) -> Service:
     if len(patch) == 0:
         return Service(1.0, np.inf)
     found = patch[patch >= 0]
-    _, count = np.unique(found, return_counts=True)
+    count = np.bincount(found)
     alike = float(np.sum(count * (count - 1.0)))  # Pairs in the same patch, without bias.
     return Service(len(found) / len(patch), len(found) * (len(found) - 1.0) / max(alike, 1.0))

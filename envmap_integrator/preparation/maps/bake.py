@@ -9,8 +9,9 @@ from blake3 import blake3
 
 from ...lookup.cube import exit_distance, face_to_direction
 from ...lookup.cube_map import Cluster, CubeMap
-from ...system.jit import KeyedNumbers, mix, upload
+from ...system.jit import mix, upload
 from ...system.progress import stage
+from ...system.random_numbers import RandomNumbers
 from ...system.ray_counts import Ray, count
 from ...system.spectrum import n_packets, n_stored, packet_wavelengths
 from ..coarse_mesh.surface_points import SurfacePoints
@@ -74,7 +75,7 @@ def bake_maps(
             )
             cluster, face = face // 6, face % 6
             key = dr.gather(mi.UInt32, keys, cluster) ^ mix(index - cluster * 6 * n_pixels)
-            sampler = KeyedNumbers.of(seed, key, lane & (dr.opaque(mi.UInt32, samples) - 1))
+            sampler = RandomNumbers.of_keys(seed, key, lane & (dr.opaque(mi.UInt32, samples) - 1))
             u = mi.Point2f(mi.Float(x), mi.Float(y)) + sampler.next_2d()
             d = dr.normalize(face_to_direction(face, 2 * u / mi.Float(resolution_) - 1))
             centre = dr.gather(mi.Point3f, centres, cluster)

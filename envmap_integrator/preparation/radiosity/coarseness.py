@@ -82,14 +82,16 @@ def coarseness(
     )
     # Throughputs of a block come to 1 at most, see ``gather``.
     most = max(float(importance.sum()), 1e-30)
-    by_patch = _exact_sums(excess, ends.rank, n_used + 1, 2 * most * largest)[:-1]
+    by_patch, of_part, of_patch = _exact_sums(
+        (excess, ends.rank, n_used + 1, 2 * most * largest),
+        (weight, ends.slot, PARTS * (n_used + 1), most),
+        (weight, ends.read_rank, n_used + 1, most),
+    )
+    by_patch = by_patch[:-1]
 
     # ---- How sure that is: by what a ray adds to it, as one of its part and one of its patch ----
-    of_part = per_ray * _exact_sums(weight, ends.slot, PARTS * (n_used + 1), most)[
-        : PARTS * n_used
-    ].reshape(-1, PARTS)
-    of_patch = _exact_sums(weight, ends.read_rank, n_used + 1, most)[:-1]
-    of_patch /= np.maximum(count.sum(axis=1), 1)
+    of_part = per_ray * of_part[: PARTS * n_used].reshape(-1, PARTS)
+    of_patch = of_patch[:-1] / np.maximum(count.sum(axis=1), 1)
     own = table[2 * members.patches + 1]
     squares = _squares(rays, arriving, blocks.rank, of_part - of_patch[:, None], own)
     variance = to_patch @ squares
@@ -125,7 +127,6 @@ class _Ends:
         self.slot = PARTS * self.rank + rays.place % PARTS
         self.known = dr.gather(mi.UInt32, upload(mi.UInt32, known), self.slot) != 0
         self.read_rank = dr.gather(mi.UInt32, rank_of_patch, rays.row >> 1)
-        dr.eval(self.rank, self.slot, self.known, self.read_rank)
 
     def weight(self, share: np.ndarray) -> mi.Float:
         """How much the picture hangs on what each ray reads; ``share`` [B] is that of its block.
@@ -134,9 +135,7 @@ class _Ends:
         """
         weight = mean_channel(self._rays.weight)
         weight *= dr.repeat(upload(mi.Float, share), self._rays.samples)
-        weight = dr.select(self.known, weight, 0)
-        dr.eval(weight)
-        return weight
+        return dr.select(self.known, weight, 0)
 
 
 @dr.syntax
@@ -180,15 +179,16 @@ def _squares(
     return dr.block_sum(square, rays.samples).numpy().astype(np.float64)
 
 
-def _exact_sums(values: mi.Float, index: mi.UInt32, size: int, most: float) -> np.ndarray:
+def _exact_sums(*wanted: tuple[mi.Float, mi.UInt32, int, float]) -> list[np.ndarray]:
     """Sums [size] of values by index, the same however threads share the work.
 
-    In integers, of which ``most`` is what all absolute values come to at most: sums of real numbers
-    depend on their order.
+    Of several ``(values, index, size, most)``, in one launch. In integers, of which ``most`` is
+    what all absolute values come to at most: sums of real numbers depend on their order.
     """
-    scale = 2.0 ** (60 - np.ceil(np.log2(most)))
-    number = mi.Int64(mi.Float64(values) * dr.opaque(mi.Float64, scale))
-    sums = dr.zeros(mi.UInt64, size)
-    dr.scatter_add(sums, mi.UInt64(number), index, mode=dr.ReduceMode.Direct)
+    scales = [2.0 ** (60 - np.ceil(np.log2(most))) for *_, most in wanted]
+    sums = [dr.zeros(mi.UInt64, size) for _, _, size, _ in wanted]
+    for (values, index, *_), scale, sum_ in zip(wanted, scales, sums, strict=True):
+        number = mi.Int64(mi.Float64(values) * dr.opaque(mi.Float64, scale))
+        dr.scatter_add(sum_, mi.UInt64(number), index, mode=dr.ReduceMode.Direct)
     dr.eval(sums)
-    return sums.numpy().view(np.int64) / scale
+    return [sum_.numpy().view(np.int64) / scale for sum_, scale in zip(sums, scales, strict=True)]

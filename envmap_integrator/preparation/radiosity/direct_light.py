@@ -10,7 +10,9 @@ import numpy as np
 
 from ...lookup.emitter_choice import EmitterChoice, Emitters
 from ...lookup.patches import normal_direction
-from ...system.jit import KeyedNumbers, mean_channel, upload, upload_vectors
+from ...system.grouping import grouped
+from ...system.jit import mean_channel, upload, upload_vectors
+from ...system.random_numbers import RandomNumbers
 from ...system.ray_counts import Ray, count
 from ...system.spectrum import random_wavelengths
 from ..coarse_mesh.build import cell_keys
@@ -60,12 +62,15 @@ def survey_direct_light(
     lane = dr.arange(mi.UInt32, n)
     member = lane // SAMPLES
     key = dr.gather(mi.UInt32, upload(mi.UInt32, members.keys), member)
-    sampler = KeyedNumbers.of(seed, key, lane % SAMPLES)
-    point = members.sample(member, sampler.next_1d())
+    numbers = RandomNumbers.of_keys(seed, key, lane % SAMPLES)
+    point = members.sample(member, numbers.next_1d())
     si = mesh.points.interaction(point)
-    si.wavelengths = random_wavelengths(sampler)
+    si.wavelengths = random_wavelengths(numbers)
     choice = by_weight(emitters)
-    ds, light = sample_irradiance(scene, choice, si, mi.UInt32(0), sampler.next_2d())
+    # In strata: neighbours send their rays to the same emitter, which is faster.
+    u = numbers.next_2d()
+    u.x = (mi.Float(lane % SAMPLES) + u.x) / SAMPLES
+    ds, light = sample_irradiance(scene, choice, si, mi.UInt32(0), u)
     irradiance = finite(mean_channel(light))
     emitter = emitters.index(ds.emitter, irradiance > 0)
     dr.eval(irradiance, emitter, si.p)
@@ -87,30 +92,36 @@ def choose_emitters(
     n, weights = emitters.count, emitters.weights
     if n < 2:
         return by_weight(emitters)
-    emitter = light.emitter.numpy().astype(np.int64)
-    # The irradiance has been divided by the weights.
-    square = np.square(light.irradiance.numpy().astype(np.float64)) * weights[emitter]
-    if not square.any():
+    lit = dr.compress(light.irradiance != 0)
+    if len(lit) == 0:
         return by_weight(emitters)
+    lit_by = dr.gather(mi.UInt32, light.emitter, lit)
+    lit_square = dr.square(mi.Float64(dr.gather(mi.Float, light.irradiance, lit)))
+    of_patch = lit // SAMPLES
+    dr.eval(lit_by, lit_square, of_patch)
+    lit_by = lit_by.numpy().astype(np.int64)
+    # The irradiance has been divided by the weights.
+    lit_square = lit_square.numpy() * weights[lit_by]
+    of_all = np.bincount(lit_by, lit_square, n)
 
     # ---- Which rays left from each cell ----
-    in_cell = light.members.cells >= 0
-    point = light.members.index[light.members.first[:-1]][in_cell]
-    cells, first, cell = np.unique(
-        light.members.cells[in_cell], return_index=True, return_inverse=True
-    )
-    n_rays = SAMPLES * np.bincount(cell, minlength=len(cells))
-    lit = square.reshape(-1, SAMPLES)[in_cell] > 0
-    cell = np.repeat(cell, lit.sum(axis=1))
-    lit_by = emitter.reshape(-1, SAMPLES)[in_cell][lit]
-    lit_square = square.reshape(-1, SAMPLES)[in_cell][lit]
+    known = np.flatnonzero(light.members.cells >= 0)
+    found = grouped(light.members.cells[known])
+    cells, first = found.keys, known[found.order[found.first[:-1]]]
+    point = light.members.index[light.members.first[first]]
+    n_rays = SAMPLES * found.counts
+    cell = np.full(len(light), -1)
+    cell[known] = found.index
+    cell = cell[of_patch.numpy()]
+    if len(known) < len(light):
+        lit_by, lit_square, cell = (x[cell >= 0] for x in (lit_by, lit_square, cell))
     n_lit = np.bincount(cell, minlength=len(cells))
 
     # ---- A row for the smallest surroundings of each cell that rays enough left from ----
     row = np.full(len(cells), -1)
     rows, n_rows = [], 0
     waiting = np.ones(len(cells), dtype=bool)
-    for group in _surroundings(mesh, point[first]):
+    for group in _surroundings(mesh, point):
         informed = np.bincount(group, n_rays)[group] >= RAYS_PER_EMITTER * n
         new = waiting & informed & (np.bincount(group, n_lit)[group] > 0)
         waiting &= ~informed
@@ -118,15 +129,17 @@ def choose_emitters(
         row[new] = n_rows + place
         rank = np.full(group.max(initial=0) + 1, -1)
         rank[used] = np.arange(len(used))
-        there = rank[group][cell]
-        slot = (there * n + lit_by)[there >= 0]
-        found = np.bincount(slot, lit_square[there >= 0], len(used) * n)
-        rows.append(found.reshape(-1, n))
+        slot = (rank * n)[group][cell] + lit_by
+        there = slot >= 0
+        squares = lit_square
+        if not there.all():
+            slot, squares = slot[there], lit_square[there]
+        rows.append(np.bincount(slot, squares, len(used) * n).reshape(-1, n))
         n_rows += len(used)
         if not waiting.any():
             break
     # The last row is for the rest, and for the empty slots of the cells' hash table.
-    rows.append(np.bincount(emitter, square, n)[None])
+    rows.append(of_all[None])
     row_of_cell = np.full(dr.width(mesh.patches.levels), n_rows)
     row_of_cell[cells] = np.where(row < 0, n_rows, row)
 

@@ -15,8 +15,9 @@ import numpy as np
 from ...lookup.irradiance_cache import packet_row
 from ...lookup.lookup import Lookup
 from ...lookup.patches import PARTS
-from ...system.jit import R1, R2, KeyedNumbers, mean_channel, mix, unit, upload
+from ...system.jit import R1, R2, mean_channel, mix, unit, upload
 from ...system.progress import stage
+from ...system.random_numbers import RandomNumbers
 from ...system.spectrum import packet_wavelengths
 from ...transport.direct_light import mis_weight
 from ...transport.path import follow
@@ -91,18 +92,19 @@ class Blocks:
 
     rank    [B]  place of a block's unknown, in ascending order
     count   [U]  number of blocks
+    one_each     whether each unknown has one
     """
 
     def __init__(self, rank: np.ndarray, n_unknowns: int):
         self.rank = rank
         self.count = np.bincount(rank, minlength=n_unknowns)
-        self._one_each = len(rank) == n_unknowns
+        self.one_each = len(rank) == n_unknowns
         self._first = upload(mi.UInt32, np.cumsum(self.count) - self.count)
         self._count = upload(mi.UInt32, self.count)
 
     def mean(self, values: mi.Spectrum) -> mi.Spectrum:
         """Means [U] over the blocks of each unknown, always summed in the same order."""
-        return values if self._one_each else self._mean(dr.ravel(values))
+        return values if self.one_each else self._mean(dr.ravel(values))
 
     @dr.syntax
     def _mean(self, values: mi.Float) -> mi.Spectrum:
@@ -159,8 +161,8 @@ def _gather(scene, lookup, unknowns, incidence, rank, keys, samples, seed) -> Ga
         member, packet = member // packets, member % packets
     key = dr.gather(mi.UInt32, upload(mi.UInt32, keys), block)
     k = lane & (dr.opaque(mi.UInt32, samples) - 1)
-    sampler = KeyedNumbers.of(seed, key, k)
-    point = members.sample(member, sampler.next_1d())
+    numbers = RandomNumbers.of_keys(seed, key, k)
+    point = members.sample(member, numbers.next_1d())
     si = members.points.interaction(point)
     patch = dr.gather(mi.UInt32, upload(mi.UInt32, members.patches), member)
     start_place = PARTS * patch + dr.gather(mi.UInt32, members.parts, point)
@@ -194,7 +196,7 @@ def _gather(scene, lookup, unknowns, incidence, rank, keys, samples, seed) -> Ga
         specular=mi.Bool(False),
     )
     above = (dr.dot(si.n, direction) > 0) & (wo.z > 0)
-    end_ = follow(scene, lookup, PathRules(), sampler, start, above)
+    end_ = follow(scene, lookup, PathRules(), numbers, start, above)
     counts = incidence(point, wo.z)
     direct += dr.pi * counts * end_.direct
     escaped = dr.pi * counts * (end_.radiance - end_.direct)

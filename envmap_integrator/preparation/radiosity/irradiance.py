@@ -64,16 +64,18 @@ def solve_irradiance(
     more_rays: int = 0,
     may_divide: bool = False,
     seed: int = 0,
+    members: PatchPoints | None = None,
 ) -> Solution:
     """Gather and solve for the irradiance of every patch.
 
+    ``members`` are the surface points of the mesh, if they have been sorted already.
     ``samples`` rays start from each patch, a power of two, and up to about ``more_rays`` where the
     picture's error hangs on them; packets of wavelengths share them. If patches turn out to be too
     large, and ``may_divide``, it ends there. With E_d the direct and E_i the indirect irradiance, b
     the light that gather rays find outside the patches, and w the throughput with which they end in
     patch j, the solution fulfils E_i = mean(π b + w E(j)), where E(j) is E_d + E_i or E_i.
     """
-    unknowns = Unknowns(PatchPoints(mesh))
+    unknowns = Unknowns(members or PatchPoints(mesh))
     samples = max(samples // unknowns.packets, 1)
     n_patches = unknowns.packets * mesh.patches.count
     n_channels, n_used = len(mi.Spectrum()), len(unknowns)

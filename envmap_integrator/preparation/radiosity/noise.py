@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.sparse import csr_matrix
+from scipy.sparse import csc_matrix, csr_matrix
 
 from ...lookup.irradiance_cache import IrradianceCache
+from ...system.grouping import grouped
 from ...system.jit import mean_channel
 from ..coarse_mesh.patch_points import PatchPoints
 from .coarseness import Coarseness, coarseness
@@ -113,16 +114,17 @@ def cache_noise(
     step = 1 << (samples.bit_length() - 1) // 2
     sources, others = rays.of_emitters, rays.of_others + of_patches
     t, i = total[rank], indirect[rank]
-    block = sum(
-        importance * _block_sum(x, samples)[:, None] / samples
-        for importance, x in ((t, sources), (i, others))
-    )
+    dr.eval(others)
+    sums = [sources, others, dr.square(rays.of_others), dr.square(of_patches)]
     if samples > 1:
         lane = dr.arange(mi.UInt32, dr.width(others)) ^ dr.opaque(mi.UInt32, step)
-        dr.eval(others)
         sources, others = (x - dr.gather(mi.Float, x, lane) for x in (sources, others))
-    products = sources * sources, others * others, 2 * sources * others
-    moments = [0.5 / samples**2 * _block_sum(x, samples) for x in products]
+    sums += sources * sources, others * others, 2 * sources * others
+    *means, escaped, patched, s_s, o_o, s_o = _block_sums(sums, samples)
+    block = sum(
+        importance * mean[:, None] / samples for importance, mean in zip((t, i), means, strict=True)
+    )
+    moments = [0.5 / samples**2 * x for x in (s_s, o_o, s_o)]
     within = sum(
         a * moment[:, None] for a, moment in zip((t * t, i * i, t * i), moments, strict=True)
     )
@@ -139,13 +141,12 @@ def cache_noise(
     variance = variance.sum(axis=1)
 
     # ---- In its surroundings ----
-    cell = np.unique(unknowns.cells, return_inverse=True)[1]
+    cell = grouped(unknowns.cells + 1).index
 
     def around(values):
         return (np.bincount(cell, values) / np.bincount(cell))[cell]
 
-    squares = (_block_sum(dr.square(x), samples) for x in (rays.of_others, of_patches))
-    escaped, patched = (np.bincount(rank, x * share) for x in squares)
+    escaped, patched = (np.bincount(rank, x * share) for x in (escaped, patched))
     return Noise(
         chance=float(chance),
         coarseness=coarse,
@@ -170,7 +171,7 @@ def _views(members: PatchPoints, irradiance: np.ndarray) -> np.ndarray:
     if not seen.any():
         seen, reflects = np.ones(len(rank)), np.ones(len(rank))
     views = []
-    for sensor in np.unique(seen[seen > 0]):
+    for sensor in 1 + np.flatnonzero(np.bincount(seen.astype(np.int64))[1:]):
         view = np.bincount(rank[seen == sensor], reflects[seen == sensor], n_patches)
         brightness = view @ irradiance
         if brightness > 0:
@@ -191,11 +192,13 @@ def _importance(rays, blocks, unknowns, views) -> tuple[np.ndarray, np.ndarray]:
     )
     rank = blocks.rank[:, None]
     weight = weight / (weight.shape[1] * blocks.count[rank])
-    place = (
-        (2 * unknowns.rank_of_patch[row >> 1] + (row & 1)).ravel(),
-        np.broadcast_to(rank, row.shape).ravel(),
-    )
-    flow = csr_matrix((weight.ravel(), place), (2 * n_patches + 2, n_patches))
+    place = (2 * unknowns.rank_of_patch[row >> 1] + (row & 1)).ravel()
+    if blocks.one_each:  # A column for each, in order: nothing needs to be sorted.
+        first = np.arange(0, place.size + 1, row.shape[1])
+        flow = csc_matrix((weight.ravel(), place, first), (2 * n_patches + 2, n_patches))
+    else:
+        places = place, np.broadcast_to(rank, row.shape).ravel()
+        flow = csr_matrix((weight.ravel(), places), (2 * n_patches + 2, n_patches))
 
     def of_patches(importance):
         """Of their total and of their indirect irradiance; what follows stands for others."""
@@ -225,6 +228,8 @@ def _spread(samples: int, count: int) -> np.ndarray:
     return step * i + within
 
 
-def _block_sum(value: mi.Float, samples: int) -> np.ndarray:
-    dr.eval(value)
-    return dr.block_sum(value, samples).numpy().astype(np.float64)
+def _block_sums(values: list[mi.Float], samples: int) -> list[np.ndarray]:
+    dr.eval(values)
+    sums = [dr.block_sum(value, samples) for value in values]
+    dr.eval(sums)
+    return [each.numpy().astype(np.float64) for each in sums]
