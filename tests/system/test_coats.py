@@ -1,10 +1,25 @@
-"""Rooms all of varnish: the cache knows from where their light comes in."""
+"""Varnish: the cache knows from where its light comes in, and what is gloss."""
 
 from __future__ import annotations
 
+import mitsuba as mi
 import pytest
 
-from tests.helpers import assert_agree, ball, block, box, integrator, load, measure, room
+from tests.helpers import (
+    assert_agree,
+    at,
+    ball,
+    block,
+    box,
+    camera,
+    grey,
+    integrator,
+    lamp,
+    load,
+    measure,
+    room,
+    scaled,
+)
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -28,3 +43,29 @@ def test_rooms_of_varnish_are_as_bright_as_by_path(name):
     expected = measure(load(described), integrator("path", max_depth=-1), spp=512, seeds=8)
     found = measure(load(described), ours, spp=128)
     assert_agree(found.overall(), expected.overall(), allowed, precision=0.004)
+
+
+def test_what_shines_on_varnish_at_grazing_angles_goes_on():
+    """Light from under a partition is reflected by the floor, away from it.
+
+    If all that the floor samples with less than 1/sr came back alike, the partition would be 3 %
+    brighter.
+    """
+    floor = {"type": "rectangle", "to_world": at(0, 0, -1.99) @ scaled(2)}
+    partition = {
+        "type": "cube",
+        "to_world": at(0, 0, 0.5) @ mi.ScalarTransform4f().scale([2, 0.05, 1.5]),
+    }
+    described = room(
+        walls=box(2.0) | grey(0.1),
+        lamp=lamp(0, 1.5, 1.9, half_width=0.3, power=40),
+        floor=floor | {"bsdf": {"type": "roughplastic", "alpha": 0.2, "diffuse_reflectance": 0.3}},
+        partition=partition | grey(0.5),
+        sensor=camera(16, 12, origin=(0, -1.9, 0.5), target=(0, 0, 0.7)),
+        block=None,
+        ball=None,
+    )
+    ours = integrator("one_level_path", patches=8192, patch_samples=256, sampler="coherent")
+    expected = measure(load(described), integrator("path", max_depth=-1), spp=4096, seeds=8)
+    found = measure(load(described), ours, spp=1024)
+    assert_agree(found.overall(), expected.overall(), allowed=0.01, precision=0.02)
