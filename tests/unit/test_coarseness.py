@@ -14,17 +14,23 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 
 def test_what_patches_cost_is_known():
-    """Patches across the end of a wall bring light behind it, whatever rays are sent."""
+    """Patches across the end of a wall bring light behind it, whatever rays are sent.
+
+    How much hangs on where the grid lies: a few sizes stand for all.
+    """
     scene = behind_a_wall()
     right, _ = solutions(scene, count=4, budget=16384, samples=64)
-    wrong, _ = solutions(scene, count=4, budget=2048, samples=64)
-    error = 1 - right.mean() / wrong.mean()
-    known = coarse_mesh(scene, 2048, 32).solution(64).noise.coarseness
-    assert known.bias - 3 * known.doubt > 0.05
+    errors, known = [], []
+    for budget in (1700, 2048, 2400):
+        wrong, _ = solutions(scene, count=2, budget=budget, samples=64)
+        errors.append(1 - right.mean() / wrong.mean())
+        known.append(coarse_mesh(scene, budget, 32).solution(64).noise.coarseness)
+    bias = np.mean([k.bias for k in known])
+    assert bias - 3 * np.mean([k.doubt for k in known]) > 0.1
     # To first order: of a large error, it is the lower bound.
-    assert error / 4 < known.bias < 1.5 * error
-    assert known.steep.any()
-    assert coarse_mesh(scene, 32768, 16).solution(64).noise.coarseness.bias < known.bias / 1.5
+    assert np.mean(errors) / 3 < bias < 1.5 * np.mean(errors)
+    assert all(k.steep.any() for k in known)
+    assert coarse_mesh(scene, 32768, 16).solution(64).noise.coarseness.bias < bias / 1.5
 
 
 def test_patches_are_small_enough_for_an_ordinary_room():
