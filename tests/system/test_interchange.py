@@ -98,6 +98,8 @@ def maps(variant, tmp_path_factory):
         "envmap_hybrid",
         desk=cluster("ball", distance_ratio=2),
         map_resolution=RESOLUTION,
+        patches=8192,  # Errors of the cache are no subject here.
+        patch_samples=256,
         baker={"type": "envmap_bake", "samples": 64},
     )
     ours.prepare(hall(), spp=64).save(files["baked"])

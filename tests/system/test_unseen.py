@@ -71,10 +71,10 @@ def test_light_at_contacts(caches):
     On average over caches, whose own noise is stated.
     """
     scene, pictures = load(contacts()), []
-    for seed in range(4):
+    for seed in range(6):
         caches(seed)
         pictures.append(picture(scene, hybrid(), 256, seed).mean(axis=-1).astype(np.float64))
-    ours = Estimate(np.mean(pictures, axis=0), np.var(pictures, axis=0, ddof=1) / 4).tiles(8)
+    ours = Estimate(np.mean(pictures, axis=0), np.var(pictures, axis=0, ddof=1) / 6).tiles(8)
     reference = measure(scene, path(), spp=2048).tiles(8)
     assert_agree(ours, reference, allowed=0.01, precision=0.05)
 
@@ -311,7 +311,7 @@ def test_rare_light(name, caches):
     """Right on average over caches, each within what it states, and it states no more than that."""
     description, expected, error = RARE[name]
     scene, means, stated = load(description()), [], []
-    for seed in range(6):
+    for seed in range(10):
         caches(seed)
         renderer = hybrid()
         stated.append(renderer.prepare(scene, spp=1024).relative_error)
@@ -324,7 +324,7 @@ def test_rare_light(name, caches):
     )
     wrong = np.sqrt(np.mean(np.square(np.array(means) / expected - 1)))
     assert 0.005 < np.mean(stated) < 0.05
-    assert wrong / 3 < np.mean(stated) < 3 * wrong  # Of six caches, to within 90 %.
+    assert wrong / 3 < np.mean(stated) < 3 * wrong  # Of ten caches: chance alone keeps within that.
 
 
 def test_ordinary_rooms_have_little_doubt():
