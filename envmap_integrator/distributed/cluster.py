@@ -26,8 +26,7 @@ def connected(address: str, tls: tuple[str, str, str] | None = None) -> Iterator
     answers there.
     """
     security = _security(address, tls)
-    # What it finds, we say in one line.
-    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
+    _say_it_ourselves()
     try:
         client = Client(address, security=security, timeout=10, set_as_default=False)
     except OSError as error:
@@ -40,6 +39,12 @@ def connected(address: str, tls: tuple[str, str, str] | None = None) -> Iterator
         raise ValueError(f'no scheduler answers at "{address}" ({reason}); {fix}') from None
     with client:
         yield client
+
+
+def _say_it_ourselves() -> None:
+    """Log neither what Dask finds nor that connections end with us: a line of ours tells it."""
+    for name in ("distributed", "distributed.client"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
 def _security(address: str, tls: tuple[str, str, str] | None) -> Security:
@@ -85,6 +90,7 @@ def local(n_workers: int, n_threads: int) -> Iterator[Client]:
         # Else one that is being restarted at the wrong moment would be given up.
         "distributed.deploy.lost-worker-timeout": "1 day",
     }
+    _say_it_ourselves()
     with (
         dask.config.set(settings),
         LocalCluster(
