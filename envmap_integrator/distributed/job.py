@@ -57,9 +57,23 @@ class Job:
     environment: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, scene: Path, **more: Any) -> Job:
-        """A job for this process's variant; ``more`` are other fields."""
-        asked = cls(str(scene.resolve()), mi.variant(), **more)
+    def of(
+        cls,
+        scene: str | Path,
+        parameters: Mapping[str, str] | None = None,
+        integrator: str | None = None,
+        settings: Mapping[str, Any] | None = None,
+        denoise: bool = False,
+    ) -> Job:
+        """A job for this process's variant; see ``render_distributed``."""
+        asked = cls(
+            str(Path(scene).resolve()),
+            mi.variant(),
+            parameters=dict(parameters or {}),
+            integrator=integrator,
+            settings=dict(settings or {}),
+            denoise=denoise,
+        )
         content = asked._file().content_hash()
         return cls(**vars(asked) | {"content": content, "environment": environment()})
 

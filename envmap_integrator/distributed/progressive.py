@@ -56,12 +56,7 @@ def progressive_distributed(
     Pictures are to the bit what ``integrator.progressive`` gives in one process for the scene
     loaded with ``optimize=False``; see there and ``render_distributed`` for the rest.
     """
-    job = Job.of(
-        Path(scene_file),
-        parameters=dict(parameters or {}),
-        integrator=integrator,
-        settings=dict(settings or {}),
-    )
+    job = Job.of(scene_file, parameters, integrator, settings)
     scene = job.load()
     return scene.integrator().progressive(
         scene,

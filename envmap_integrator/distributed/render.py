@@ -81,12 +81,7 @@ def render_views(
 
     They share a baked state where one serves them.
     """
-    job = Job.of(
-        Path(scene_file),
-        parameters=dict(parameters or {}),
-        integrator=integrator,
-        settings=dict(settings or {}),
-    )
+    job = Job.of(scene_file, parameters, integrator, settings)
     yield from render_job(client, job, job.load(), views, spp, seed, time_limit)
 
 
