@@ -22,9 +22,8 @@ from envmap_integrator.cli.timing import compilation_time, measure, record_kerne
 from envmap_integrator.imaging.denoiser import denoise, prepare_for_denoiser, warm_up
 from envmap_integrator.imaging.film import has_bands
 from envmap_integrator.imaging.progressive import Improving
-from envmap_integrator.inspection.page import load_template, page
-from envmap_integrator.inspection.survey import survey
-from envmap_integrator.system.atomic import check_writable, replacing
+from envmap_integrator.inspection import page
+from envmap_integrator.system.atomic import check_writable
 from envmap_integrator.system.llvm import ensure_llvm
 from envmap_integrator.system.scene_file import DEFAULT_INTEGRATOR, SceneFile
 
@@ -157,9 +156,13 @@ def _progress(better: Improving, elapsed: float, args: argparse.Namespace, total
     if args.target_error and math.isfinite(better.error):
         left.append(better.pace * better.spp * (better.error / args.target_error - 1))
     noise = f"noise {better.error:.1e}" if math.isfinite(better.error) else "noise unknown"
-    time_left = f"about {0 if better.is_last else max(min(left), 0):.0f} s left"
-    if not (better.pace or better.is_last):
+    time_left = f"about {max(min(left), 0):.0f} s left"
+    if better.is_last:
+        time_left = "about 0 s left"
+    elif not better.pace:
         time_left = "kept from before"
+    elif math.isinf(better.error):  # A single pass, which may have compiled kernels.
+        time_left = time_left.replace("about", "at most")
     return f"{better.spp} samples per pixel, {noise}, {elapsed:.1f} s; {time_left}"
 
 
@@ -230,7 +233,6 @@ def inspect(args: argparse.Namespace) -> int:
     output = args.output or args.scene.with_suffix(".html")
     check_output(output, ".html")
     _require(args.spp >= 0, f"--spp must not be negative, got {args.spp}")
-    template = load_template()  # Fails before the work starts, if it's missing.
     _configure_machine(args)
     seconds: dict[str, float] = {}
     with record_kernels():
@@ -246,12 +248,10 @@ def inspect(args: argparse.Namespace) -> int:
             scene = scene_file.load(merge_meshes=False)  # Shapes keep their names.
         sensor = _sensor(scene, args.sensor)
         settings = _settings(args, scene_file, scene, sensor)
-        with measure(seconds, "survey"):
-            found = survey(scene, sensor, scene.integrator(), settings["spp"], args.seed)
-        with measure(seconds, "page"):
-            text = page(template, found, scene, sensor, str(args.scene), settings)
-            with replacing(output) as file:
-                file.write(text.encode())
+        with measure(seconds, "survey and page"):
+            page.inspect(
+                output, scene, sensor=sensor, spp=args.spp, seed=args.seed, settings=settings
+            )
         compilation = compilation_time()
     _report(args, seconds, compilation, output, settings=settings)
     return 0

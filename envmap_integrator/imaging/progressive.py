@@ -33,7 +33,8 @@ class Improving:
     spp       samples per pixel
     error     relMSE by the noise that is left in its radiance, infinite after a single pass; what
               cache and maps get wrong isn't part of it
-    pace      seconds that a sample of all pixels takes, 0 if there is nothing to do
+    pace      seconds that a sample of all pixels takes, 0 if there is nothing to do; after a single
+              pass, with the compilation of kernels
     is_last   whether no other comes
     state     the ``BakedState`` that it's rendered with
     """
@@ -89,8 +90,9 @@ def improve(
     It ends after ``total`` samples per pixel, if another pass would take longer than to the
     ``deadline`` of ``time.perf_counter``, or with an error of at most ``target``.
     """
-    begin, n_before = time.perf_counter(), progress.samples
-    pace, enough = 0.0, math.inf
+    # Pace is counted from here, and from the end of the first pass on, which may compile kernels.
+    begin, n_begin = time.perf_counter(), progress.samples
+    n_before, pace, enough = n_begin, 0.0, math.inf
     due, last = n_before > 0, n_before >= total  # What there is already is shown at once.
     plan = passes(progress, seed, spp, total)
     rendered = render(passes(progress, seed, spp, total))
@@ -108,7 +110,9 @@ def improve(
                 return
             _take(next(plan), rendered, progress)
             now = time.perf_counter()
-            pace = (now - begin) / (progress.samples - n_before)
+            pace = (now - begin) / (progress.samples - n_begin)
+            if n_begin == n_before:
+                begin, n_begin = now, progress.samples
             last = progress.samples >= total or now + pace * spp > deadline
             due = last or _worth_it(-(-progress.samples // spp)) or progress.samples >= enough
     except KeyboardInterrupt:

@@ -26,11 +26,13 @@ def percent(share: float) -> str:
 
 def in_short(survey: Survey) -> list[str]:
     """Why the picture is as it is, in a few sentences."""
-    error, aovs = survey.view.state.relative_error, survey.view.aovs
+    state, aovs = survey.view.state, survey.view.aovs
+    error, by_size = state.relative_error, state.size_error
+    remedy = "Raise patches." if 2 * by_size**2 > error**2 else "Raise patch_samples."
     found = [
         f"The cache may make the picture too bright or too dark by {percent(error)} (one standard "
         "error), which more samples don't change. "
-        + ("Raise patch_samples or patches." if error > ERROR else "That is little."),
+        + (remedy if error > ERROR else "That is little."),
     ]
     if np.isfinite(survey.noise):
         found.append(

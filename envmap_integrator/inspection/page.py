@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,10 @@ import numpy as np
 
 from ..imaging.aovs import false_colour
 from ..preparation.maps.clusters import LOOK_UP_COST
+from ..system.atomic import check_writable, replacing
 from . import advice
 from .pictures import eight_bits, embedded, on_ramp, ramp_css, shrunk, tone_mapped, white_of
-from .survey import ClusterView, Survey, View
+from .survey import ClusterView, Survey, View, survey
 from .unfolded import Faces, unfolded
 from .wires import Wires, wires
 
@@ -58,7 +60,42 @@ class Shown:
     flags: str
 
 
-def load_template() -> Any:
+def inspect(
+    path: str | os.PathLike,
+    scene: mi.Scene,
+    integrator: mi.Integrator | None = None,
+    sensor: mi.Sensor | int = 0,
+    spp: int = 0,
+    seed: int = 0,
+    settings: dict[str, object] | None = None,
+) -> None:
+    """Write an HTML page that tells why pictures of a scene are as they are.
+
+    It's about a render of ``spp`` samples per pixel (0: the sensor's) by an ``envmap_hybrid`` or
+    ``one_level_path``, the scene's own if none is passed. ``settings`` are shown on it. Shapes go
+    by their ids: where ``mi.load_file`` has merged meshes they have none, see ``optimize``.
+
+    Raises ``ValueError`` for other integrators and as ``integrator.prepare`` does, ``ImportError``
+    if the optional package jinja2 is missing, and ``StorageError`` if there can be no such file.
+    """
+    integrator = integrator or scene.integrator()
+    if not hasattr(integrator, "aovs"):
+        raise ValueError(
+            f'integrator "{integrator.class_name()}" has nothing to inspect: pass '
+            'integrator=mi.load_dict({"type": "envmap_hybrid"})'
+        )
+    template = _load_template()  # What may be missing is found before the work starts.
+    check_writable(Path(path))
+    sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+    spp = spp or sensor.sampler().sample_count()
+    settings = settings or {"spp": spp, "seed": seed, "integrator": integrator}
+    found = survey(scene, sensor, integrator, spp, seed)
+    text = _page(template, found, scene, sensor, settings)
+    with replacing(path) as file:
+        file.write(text.encode())
+
+
+def _load_template() -> Any:
     """The page's template; raises ``ImportError`` if the optional package jinja2 is missing."""
     try:
         import jinja2
@@ -74,15 +111,14 @@ def load_template() -> Any:
     return environment.get_template("page.html.j2")
 
 
-def page(
+def _page(
     template: Any,
     survey: Survey,
     scene: mi.Scene,
     sensor: mi.Sensor,
-    title: str,
     settings: dict[str, object],
 ) -> str:
-    """The page of a survey, by ``load_template()``; ``settings`` are shown as they are."""
+    """The page of a survey; ``settings`` are shown as they are, ``scene`` among them on top."""
     view = survey.view
     aovs = {name: shrunk(picture) for name, picture in view.aovs.items()}
     picture = shrunk(survey.picture)
@@ -94,7 +130,7 @@ def page(
     height, width = survey.picture.shape[:2]
     with_maps = survey.mapped or view
     return template.render(
-        title=title,
+        title=settings.get("scene", "a scene"),
         survey=survey,
         in_short=advice.in_short(survey),
         state=view.state,

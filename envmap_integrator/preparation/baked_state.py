@@ -117,6 +117,7 @@ class BakedState:
     service            ... and what the coarse mesh does for them
     relative_error     [1]          error of the brightness of their pictures, of the worst, that
                                     comes from the noise of the cache and the size of the patches
+    size_error         [1]          ... from the latter alone, as far as it's beyond doubt
     maps               one cube map per cluster
     cluster_of_cell    cluster index of each large cell, ``len(maps)`` where there is none
     stage_times        seconds spent in each stage
@@ -129,6 +130,7 @@ class BakedState:
     views: tuple[str, ...]
     service: Service
     relative_error: float
+    size_error: float
     maps: tuple[CubeMap, ...] = ()
     cluster_of_cell: np.ndarray | None = None
     stage_times: dict[str, float] = field(default_factory=dict)
@@ -176,6 +178,7 @@ def save(path: str | os.PathLike, prepared: BakedState) -> None:
         "views": list(prepared.views),
         "service": [asdict(prepared.service)],
         "relative_error": prepared.relative_error,
+        "size_error": prepared.size_error,
         "maps": maps,
         "stage_times": prepared.stage_times,
     }
@@ -254,6 +257,7 @@ def _prepared(stored: Stored, key: StateKey, n_emitters: int, but: Collection[st
         tuple(stored.texts("views")),
         Service(service.number("found"), service.number("patches")),
         stored.number("relative_error"),
+        stored.number("size_error"),
         maps,
         membership,
         stored.numbers("stage_times"),

@@ -115,6 +115,7 @@ def prepare(
         tuple(map(view_name, sensors)),
         usual_service(mesh),
         solution.relative_error,
+        solution.size_error,
         maps,
         membership,
         times,

@@ -6,6 +6,7 @@ import base64
 import json
 import re
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import drjit as dr
@@ -15,6 +16,7 @@ import pytest
 
 from envmap_integrator.cli import main
 from envmap_integrator.inspection.advice import about_cluster, as_flags, as_xml, in_short
+from envmap_integrator.inspection.page import inspect as write_page
 from envmap_integrator.inspection.pictures import RAMP, embedded, on_ramp, shrunk, tone_mapped
 from envmap_integrator.inspection.survey import ClusterView, survey
 from envmap_integrator.inspection.unfolded import MASKED, SKY, Faces, unfolded
@@ -111,6 +113,30 @@ def test_json(tmp_path, capfd):
     assert result["output"] == str(page) and page.exists()
     assert result["settings"]["integrator"] == "one_level_path"
     assert "There are no maps" in page.read_text(encoding="utf-8")
+
+
+def test_a_scene_made_in_python(tmp_path):
+    """It needs no file; the integrator may be another one than the scene's."""
+    path = tmp_path / "page.html"
+    ours = integrator("envmap_hybrid", sampler="coherent", desk=cluster("ball"))
+    write_page(path, load(room()), ours, spp=4)
+    text = path.read_text(encoding="utf-8")
+    assert re.findall(r'<h2 id="(\w+)">', text) == PARTS
+    assert "--set desk.shapes=ball" in text and "spp: 4" in text
+    with pytest.raises(ValueError, match="has nothing to inspect"):
+        write_page(path, load(room()), mi.load_dict({"type": "path"}))
+
+
+@pytest.mark.parametrize(
+    ("error", "by_size", "remedy"),
+    [(0.03, 0.0, "patch_samples."), (0.03, 0.025, "Raise patches."), (0.001, 0.001, "little")],
+)
+def test_what_lowers_the_error(error, by_size, remedy):
+    scene, ours = load(room()), integrator("one_level_path", sampler="coherent")
+    found = survey(scene, scene.sensors()[0], ours, 4, 0)
+    state = replace(found.view.state, relative_error=error, size_error=by_size)
+    found = replace(found, view=replace(found.view, state=state))
+    assert remedy in in_short(found)[0]
 
 
 def test_a_survey_is_of_the_render_asked_for():

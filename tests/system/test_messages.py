@@ -33,7 +33,7 @@ from envmap_integrator.distributed.worker import Outcome
 from envmap_integrator.imaging import film
 from envmap_integrator.imaging.aovs import parse_aovs
 from envmap_integrator.imaging.denoiser import warm_up
-from envmap_integrator.inspection.page import load_template
+from envmap_integrator.inspection.page import inspect
 from envmap_integrator.preparation.maps.clusters import ClusterRequest, listed_clusters
 from envmap_integrator.system import memory, storage
 from envmap_integrator.system.atomic import check_writable, replacing
@@ -305,7 +305,7 @@ def xml(text: str) -> Callable:
 
 def without_jinja(s: Surroundings) -> None:
     s.patch.setitem(sys.modules, "jinja2", None)
-    load_template()
+    inspect("a.html", load(room()), integrator("envmap_hybrid"))
 
 
 def without_denoiser(s: Surroundings) -> None:
@@ -697,6 +697,10 @@ CASES = {
     "nothing to inspect": Case(
         shell(commands.inspect, output="b.html", integrator="path"), "integrator", '"path"',
         "pass --integrator envmap_hybrid",
+    ),
+    "nothing to inspect, from Python": Case(
+        lambda _: inspect("a.html", load(room()), mi.load_dict({"type": "path"})),
+        "integrator", '"PathIntegrator"', "pass integrator=mi.load_dict",
     ),
     "no templates": Case(without_jinja, "jinja2", "is missing", "pip install jinja2"),
     "no colour": Case(

@@ -44,9 +44,9 @@ class Coarseness:
     steep_bias: float
 
     @property
-    def squared_error(self) -> float:
-        """Square of the relative error, as far as it's beyond doubt."""
-        return max(abs(self.bias) - self.doubt, 0.0) ** 2
+    def error(self) -> float:
+        """The relative error, without sign, as far as it's beyond doubt."""
+        return max(abs(self.bias) - self.doubt, 0.0)
 
 
 def coarseness(

@@ -55,6 +55,11 @@ class Solution:
         """``Noise.error``; 0 without patches, as paths are traced to their end."""
         return self.noise.error if self.noise else 0.0
 
+    @property
+    def size_error(self) -> float:
+        """The part of it that the size of the patches brings, as far as it's beyond doubt."""
+        return self.noise.coarseness.error if self.noise else 0.0
+
 
 def solve_irradiance(
     scene: mi.Scene,

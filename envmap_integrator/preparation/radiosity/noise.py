@@ -59,7 +59,7 @@ class Noise:
     @property
     def error(self) -> float:
         """Relative error [1] of the picture's brightness, by chance and by the size of patches."""
-        return float(np.sqrt(self.chance**2 + self.coarseness.squared_error))
+        return float(np.sqrt(self.chance**2 + self.coarseness.error**2))
 
     @property
     def steep(self) -> np.ndarray:
