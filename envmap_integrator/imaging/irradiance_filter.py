@@ -7,6 +7,11 @@ space, this filter averages it in the image over places between which it can't c
 a tolerance (Kontkanen, Räsänen and Keller 2004). Direct light, sources, gloss and textures aren't
 touched.
 
+Where a surface ends, all neighbours are on one side, and the mean is that of a place farther in,
+often brighter by much: beside a dark wall or a reveal, irradiance falls faster than by the model,
+as what is left of it is small. So a plane is fitted to what they have (local linear regression,
+Fan 1992), and the pixel gets the value at its own place, as far as that is certain.
+
 Rare bright samples would become discs as wide as the filter. As Zirr, Hanika and Dachsbacher (2018)
 do, it asks how many others have found as much: where hardly any has, a pixel shares only what is
 usual around it. The excess goes to an area so much larger that it doesn't show, and what would show
@@ -16,6 +21,7 @@ even there stays in the pixel. So no light is lost.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from operator import add
 
 import drjit as dr
 import mitsuba as mi
@@ -40,6 +46,8 @@ STRIDE = 4
 #: Most of the excess that is spread, over what an outlier shares as others do. The excess covers
 #: STRIDE² times the area and STRIDE times the width: with STRIDE³ it fades as gently as the share.
 MOST_SPREAD = STRIDE**3
+#: Variance of a place within its pixel [pixels²], along either side.
+WITHIN_PIXEL = 1 / 12
 #: Floats of a pixel's record: a cache line. Which of them say how much a pixel shares and spreads.
 _RECORD, _SHARE, _SPREAD = 16, 11, 15
 _DIAMETER = 2 * RADIUS + 1
@@ -66,11 +74,11 @@ def filter_irradiance(records: mi.Float, width: int, allowed: float) -> mi.Spect
     dr.scatter(records, spread, _RECORD * pixel + _SPREAD)
     own = _Record.of(records, pixel, True)
     reached = _reached(spread > 0, width)
-    far = _average(records, width, sharpness, STRIDE, _Record.spread, reached)
-    shared, kept = own.shared() + far, own.radiance - own.shared() - own.spread()
+    far = _share(records, width, sharpness, STRIDE, _Record.spread, _mean, reached)
+    shared, kept = own.shared() + far, own.whole() - own.shared() - own.spread()
     dr.eval(shared, kept)
-    dr.scatter(records, shared, (_RECORD // 4) * pixel + 2)
-    result = _average(records, width, sharpness, 1, _Record.whole, mi.Bool(True)) + kept
+    dr.scatter(records, mi.Vector4f(*shared, 0), (_RECORD // 4) * pixel + 2)
+    result = _share(records, width, sharpness, 1, _Record.whole, _level, mi.Bool(True)) + kept
     kind = colour_type()
     result = kind(*(result[c] for c in range(len(kind()))))
     dr.eval(result)
@@ -124,17 +132,17 @@ class _Record:
         first = (_RECORD // 4) * pixel
         return cls(*(dr.gather(mi.Vector4f, records, first + i, active) for i in range(4)))
 
-    def shared(self) -> mi.Vector4f:
+    def shared(self) -> mi.Vector3f:
         """Radiance that the pixels around get a part of."""
-        return self.radiance.w * self.radiance
+        return self.radiance.w * self.radiance.xyz
 
-    def spread(self) -> mi.Vector4f:
+    def spread(self) -> mi.Vector3f:
         """Radiance that pixels ``STRIDE`` apart get a part of."""
-        return self.albedo.w * self.radiance
+        return self.albedo.w * self.radiance.xyz
 
-    def whole(self) -> mi.Vector4f:
+    def whole(self) -> mi.Vector3f:
         """All radiance."""
-        return self.radiance
+        return self.radiance.xyz
 
     def similarity(self, other: _Record, sharpness: mi.Float) -> mi.Float:
         """1 where the other has the same irradiance, 0 where it has any or none."""
@@ -201,25 +209,66 @@ def _support(records, width, sharpness, stride, active):
 
 
 @dr.syntax
-def _average(records, width, sharpness, stride, part, needed):
-    """That ``part`` of radiance which goes with the mean irradiance of pixels ``stride`` apart.
+def _share(records, width, sharpness, stride, part, estimate, needed):
+    """That ``part`` of radiance which goes with irradiance as pixels ``stride`` apart have it.
 
-    Where that isn't ``needed``, a pixel keeps its own.
+    ``estimate`` makes it of their ``_moments``. Where that isn't ``needed``, a pixel keeps its own.
     """
     pixel = _pixels(records)
     own = _Record.of(records, pixel, True)
+    albedo = own.albedo.xyz
     i = mi.UInt32(0)
     active = needed & (own.place.w > 0)
-    radiance, albedo = mi.Vector4f(part(own)), mi.Vector4f(own.albedo)
+    sums = _moments(part(own), albedo, mi.Float(1), mi.Float(0), mi.Float(0))
     while dr.hint(active & (i < _N_PLACES), exclude=[records], label="Share irradiance"):
         other, taper = _neighbour(records, width, pixel, i, stride)
         theirs = _Record.of(records, other, active & (taper > 0))
-        weight = taper * own.similarity(theirs, sharpness)
-        radiance += dr.select(weight > 0, weight * part(theirs), 0)
-        albedo += dr.select(weight > 0, weight * theirs.albedo, 0)
+        weight = dr.select(taper > 0, taper * own.similarity(theirs, sharpness), 0)
+        dx, dy = (mi.Float(d) for d in _offset(i))
+        sums = [*map(add, sums, _moments(part(theirs), theirs.albedo.xyz, weight, dx, dy))]
         i += 1
-    mean = dr.select(albedo > 0, radiance / albedo, 0) * own.albedo
-    return dr.select((own.place.w > 0) & (own.albedo > 0), mean, part(own))
+    return dr.select(active & (albedo > 0), estimate(sums) * albedo, part(own))
+
+
+def _moments(radiance, albedo, weight, dx, dy):
+    """What a pixel adds to sums over those around one, each a colour.
+
+    Each counts by its albedo, too. They are the weight, irradiance, the square of the weight, x, y
+    and the products of these, irradiance times x and y, and its square.
+    """
+    w = dr.select(weight > 0, weight * albedo, 0)
+    e = dr.select(w > 0, weight * radiance, 0)
+    square = dr.select(w > 0, e * radiance / albedo, 0)
+    products = (w * dx * dx, w * dx * dy, w * dy * dy)
+    return [w, e, w * w, w * dx, w * dy, *products, e * dx, e * dy, square]
+
+
+def _mean(sums):
+    """The mean irradiance, from sums of ``_moments``."""
+    return sums[1] / sums[0]
+
+
+def _level(sums):
+    """The irradiance in the middle, as a plane fitted to that around it has it, from ``_moments``.
+
+    It differs from the mean by ``change``. The square of that is too large by the variance of its
+    noise, on average, as the scatter around the plane tells it: so much is taken off, and nothing
+    is left of a change that might be noise alone. Pixels have a width: on a line of them, the slope
+    across is 0.
+    """
+    weight, e, squares, *others = sums
+    e, x, y, xx, xy, yy, ex, ey, ee = (s / weight for s in (e, *others))
+    n_alike = dr.square(weight) / squares
+    xx, xy, yy = xx - x * x + WITHIN_PIXEL, xy - x * y, yy - y * y + WITHIN_PIXEL
+    ex, ey, ee = ex - e * x, ey - e * y, ee - e * e
+    determinant = xx * yy - xy * xy
+    u, v = (yy * x - xy * y) / determinant, (xx * y - xy * x) / determinant
+    change = -(u * ex + v * ey)
+    explained = (yy * ex * ex - 2 * xy * ex * ey + xx * ey * ey) / determinant
+    scatter = dr.maximum(ee - explained, 0) / (n_alike - 3)  # A plane takes three of them.
+    noise = scatter * (u * x + v * y)
+    certain = (n_alike > 3) & (dr.square(change) > noise)
+    return dr.maximum(e + dr.select(certain, change - noise / change, 0), 0)
 
 
 def _pixels(records: mi.Float) -> mi.UInt32:
@@ -247,10 +296,15 @@ def _neighbour(records, width, pixel, i, stride):
     """
     width_ = dr.opaque(mi.Int32, width)
     height = dr.opaque(mi.Int32, dr.width(records) // (_RECORD * width))
-    place = (i + _N_PLACES // 2) % _N_PLACES
-    dx, dy = mi.Int32(place % _DIAMETER) - RADIUS, mi.Int32(place // _DIAMETER) - RADIUS
+    dx, dy = _offset(i)
     taper = 1 - mi.Float(dx * dx + dy * dy) / (RADIUS + 1) ** 2
     x = mi.Int32(pixel) % width_ + stride * dx
     y = mi.Int32(pixel) // width_ + stride * dy
     inside = (x >= 0) & (x < width_) & (y >= 0) & (y < height) & ((dx != 0) | (dy != 0))
     return mi.UInt32(y * width_ + x), dr.select(inside, dr.maximum(taper, 0), 0)
+
+
+def _offset(i):
+    """Where the i-th pixel is, in units of the stride across and down."""
+    place = (i + _N_PLACES // 2) % _N_PLACES
+    return mi.Int32(place % _DIAMETER) - RADIUS, mi.Int32(place // _DIAMETER) - RADIUS

@@ -29,7 +29,10 @@ Y, X = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)
 def filtered(
     irradiance, albedo=0.5, normal=(0, 0, 1), position=None, nearness=0.1, weight=1.0, spp=16
 ) -> np.ndarray:
-    """The filtered radiance [H, W] of a picture of a plane that is one unit a pixel."""
+    """The filtered radiance [H, W] of a picture of a plane that is one unit a pixel.
+
+    It's that of the first colour, if ``irradiance`` and ``albedo`` are [H, W, 3].
+    """
     if position is None:
         position = np.stack([X, Y, np.zeros_like(X)], axis=-1) / 100
 
@@ -40,9 +43,14 @@ def filtered(
         channels = [upload(mi.Float, sums[..., i]) for i in range(n)]
         return channels if n > 1 else channels[0]
 
+    def spectrum(values):
+        if np.ndim(values) < 3:
+            return mi.Spectrum(image(values))
+        return mi.Spectrum(*image(values, 3)[: len(mi.Spectrum())])
+
     gathered = Gathered(
-        radiance=mi.Spectrum(image(np.multiply(irradiance, albedo))),
-        albedo=mi.Spectrum(image(albedo)),
+        radiance=spectrum(np.multiply(irradiance, albedo)),
+        albedo=spectrum(albedo),
         normal=mi.Vector3f(image(normal, 3)),
         position=mi.Vector3f(image(position, 3)),
         nearness=image(nearness),
@@ -99,6 +107,35 @@ def test_gradients_stay():
     ramp = 1 + X / WIDTH
     inner = np.s_[RADIUS:-RADIUS, RADIUS:-RADIUS]
     np.testing.assert_allclose(filtered(ramp)[inner], ramp[inner] / 2, rtol=1e-4)
+
+
+EDGE = 16
+CORNER = np.where(X[..., None] < EDGE, (0, 0, 1), (-1, 0, 0))
+
+
+def test_gradients_stay_where_a_surface_ends():
+    """Beside a corner and at the picture's border, where a mean is 14 % off."""
+    ramp = 1 + np.abs(X + 0.5 - EDGE) / 10
+    result = filtered(ramp, normal=CORNER, nearness=1e-6) / 0.5
+    np.testing.assert_allclose(result, ramp, rtol=0.015)
+
+
+def test_chance_is_no_gradient():
+    """Where a surface ends, noise falls nearly as by a mean of those that are on one side."""
+    noise = np.random.default_rng(5).exponential(size=(HEIGHT, WIDTH))
+    edge = filtered(noise, normal=CORNER, nearness=1e-6)[RADIUS:-RADIUS, [EDGE - 1, EDGE]] / 0.5
+    dy, dx = np.mgrid[-RADIUS : RADIUS + 1, : RADIUS + 1]
+    taper = np.maximum(1 - (dx**2 + dy**2) / (RADIUS + 1) ** 2, 0)
+    assert edge.var() < 2 * (taper**2).sum() / taper.sum() ** 2
+    assert edge.mean() == pytest.approx(1, abs=0.05)
+
+
+def test_colours_of_textures_are_no_gradient():
+    """Under coloured light they are unequally bright, but irradiance is the same."""
+    albedo = np.random.default_rng(6).uniform(0, 1, (HEIGHT, WIDTH, 3))
+    albedo[: HEIGHT // 2] *= (1, 0.3, 0.1)
+    result = filtered(np.array([1.0, 3.0, 9.0]), albedo, nearness=1e-6)
+    np.testing.assert_allclose(result, albedo[..., 0], rtol=1e-4)
 
 
 def test_pixels_without_a_surface_give_and_get_nothing():
