@@ -12,7 +12,7 @@ from ..system.jit import opaque_point
 from ..system.ray_counts import Ray, count
 from .direct_light import WideShare, sample_emitter, sample_emitters
 from .gathered import Gathered
-from .lobes import Scattered, is_delta, is_diffuse, single_lobe
+from .lobes import Lobes, Scattered, is_delta, is_diffuse, single_lobe
 from .path import follow, survival_probability
 from .rules import PathRules
 from .state import PathStart, camera_path
@@ -168,7 +168,9 @@ def follow_mirrors(
         emitted += throughput * si.emitter(scene).eval(si, active)
         u, v = sampler.next_1d(), sampler.next_2d()
         bsdf = si.bsdf(ray)
-        scattered = Scattered.of(bsdf, si, *bsdf.sample(mi.BSDFContext(), si, u, v, active))
+        scattered = Lobes.of(bsdf, si, active).scattered(
+            u, *bsdf.sample(mi.BSDFContext(), si, u, v, active)
+        )
         bs = scattered.bs
         solid |= active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         throughput[active] *= scattered.weight
@@ -240,8 +242,8 @@ def leave(
 ) -> tuple[PathStart, Scattered]:
     """Start of a secondary ray from a camera hit, and the direction that the material sampled."""
     bsdf, si = vertex.bsdf, vertex.si
-    scattered = Scattered.of(
-        bsdf, si, *bsdf.sample(mi.BSDFContext(), si, u, sampler.next_2d(), active)
+    scattered = vertex.lobes.scattered(
+        u, *bsdf.sample(mi.BSDFContext(), si, u, sampler.next_2d(), active)
     )
     bs = scattered.bs
     start = PathStart(

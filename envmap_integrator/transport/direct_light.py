@@ -13,7 +13,6 @@ import mitsuba as mi
 
 from ..lookup.emitter_choice import EmitterChoice
 from ..system.ray_counts import Ray, count
-from .lobes import wide_share
 from .vertex import Vertex
 
 
@@ -62,7 +61,7 @@ def reflected(
         infinite = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
         beyond = infinite | (vertex.cube.exit(si.p, ds.d) < ds.dist)
         alone |= vertex.cube.valid & beyond
-    wide = wide_share(vertex.bsdf, si, si.to_local(ds.d), bsdf_pdf)
+    wide = vertex.lobes.wide_share(si.to_local(ds.d), bsdf_value, active)
     of_wide = dr.select(share.lit, 0, wide * share.boost)
     of_wide *= dr.select(ds.delta, 1, mis_weight(ds.pdf, dr.select(alone, 0, bsdf_pdf)))
     of_others = (1 - wide) * dr.select(ds.delta, 1, mis_weight(ds.pdf, bsdf_pdf))
@@ -119,19 +118,20 @@ def sample_with_emitter(
     share: WideShare,
     sampler: mi.Sampler,
     active: mi.Bool,
-) -> tuple[mi.Spectrum, mi.BSDFSample3f, mi.Spectrum]:
+) -> tuple[mi.Spectrum, mi.Float, mi.BSDFSample3f, mi.Spectrum]:
     """As ``sample_emitter``, and a direction sampled from the material, in a single call of it.
 
-    Returns the light, the direction and its weight.
+    Returns the light, the random number that chose a lobe, the direction and its weight.
     """
     si = vertex.si
     ds, em_weight = emitters.sample_direction(si, vertex.emitter_row, sampler.next_2d(), active)
+    lobe = sampler.next_1d()
     value, pdf, bs, weight = vertex.bsdf.eval_pdf_sample(
         mi.BSDFContext(),
         si,
         si.to_local(ds.d),
-        sampler.next_1d(),
+        lobe,
         sampler.next_2d(),
         vertex.hit,
     )
-    return reflected(scene, vertex, share, ds, em_weight, value, pdf, active), bs, weight
+    return reflected(scene, vertex, share, ds, em_weight, value, pdf, active), lobe, bs, weight

@@ -110,7 +110,7 @@ def end_in_cache(
     weight = dr.select(asked & scattered.wide, scattered.weight, 0)
     ends = service.served & scattered.wide
     several = asked & ~single_lobe(vertex.bsdf)
-    of_wide, other = choose_lobes(vertex.bsdf, vertex.si, sampler, several, residual)
+    of_wide, other = choose_lobes(vertex.lobes, scattered, sampler, several, residual)
     weight = dr.select(several, of_wide, weight)
     scattered = dr.select(several, other, scattered)
     ends = dr.select(several, dr.max(scattered.weight) == 0, ends)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..system.jit import mix, unit
+from ..system.jit import mean_channel, mix, unit
 
 #: Choices among the lobes of a surface that the cache serves: those that it can't stand for, such
 #: as the gloss of a varnish, are found as many times more often as if one choice were made.
@@ -44,23 +44,6 @@ def only_wide(bsdf: mi.BSDFPtr) -> mi.Bool:
     return (flags & int(narrow)) == 0
 
 
-def wide_share(
-    bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, pdf: mi.Float
-) -> mi.Float:
-    """Part [1] of the light reflected from ``wo`` for which cached irradiance may stand.
-
-    ``wo`` is in the local frame, ``pdf`` [1/sr] the density with which the material samples it. As
-    much as a cosine lobe would sample belongs to wide lobes, what exceeds it to gloss. (Gloss is
-    brightest at grazing angles, where cosine lobes sample least: no single density tells the two
-    apart.) Without gloss all is wide, also where bumps turn the cosine. The cache holds the side
-    that the path arrived on: transmission never qualifies.
-    """
-    cosine = mi.Frame3f.cos_theta(wo)
-    wide = dr.abs(cosine) * dr.inv_pi
-    share = dr.select(only_wide(bsdf) | (pdf <= wide), 1, wide / pdf)
-    return dr.select(mi.Frame3f.cos_theta(si.wi) * cosine > 0, share, 0)
-
-
 @dataclass
 class Scattered:
     """Where a path goes on from a surface.
@@ -69,39 +52,83 @@ class Scattered:
     weight     [1]  ... what the path is multiplied by, zero if it goes nowhere,
     specular   ... whether it is that of a mirror or of glass,
     wide       ... and whether it belongs to the lobes that the cache may stand for
+    lobe       the random number that has chosen among the lobes
     """
 
     bs: mi.BSDFSample3f
     weight: mi.Spectrum
     specular: mi.Bool
     wide: mi.Bool
+    lobe: mi.Float
+
+
+@dataclass
+class Lobes:
+    """The lobes of a material at a surface.
+
+    bsdf, si
+    every      whether all of them but perfect mirrors are wide
+    most       [1]  reflectance of a diffuse lobe that is beside others
+    """
+
+    bsdf: mi.BSDFPtr
+    si: mi.SurfaceInteraction3f
+    every: mi.Bool
+    most: mi.Spectrum
 
     @staticmethod
-    def of(
-        bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, bs: mi.BSDFSample3f, weight: mi.Spectrum
-    ) -> Scattered:
-        """A direction that a material has sampled.
+    def of(bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, active: mi.Bool | bool) -> Lobes:
+        """Those of what ``si`` has hit."""
+        every = only_wide(bsdf)
+        return Lobes(bsdf, si, every, bsdf.eval_diffuse_reflectance(si, active & ~every))
+
+    def wide_share(
+        self, wo: mi.Vector3f, value: mi.Spectrum, active: mi.Bool | bool = True
+    ) -> mi.Spectrum:
+        """Part [1] of the light reflected from ``wo`` for which cached irradiance may stand.
+
+        ``wo`` is in the local frame, and ``value`` the BSDF there, times the cosine. What it is by
+        its diffuse lobe is wide, the rest is gloss. Some materials can't tell their lobes apart: of
+        those it's as much as a Lambertian surface of their reflectance would have. Without gloss
+        all is wide, also where bumps turn the cosine. The cache holds the side that the path
+        arrived on: transmission never qualifies.
+        """
+        context = mi.BSDFContext()
+        context.type_mask = mi.BSDFFlags.DiffuseReflection
+        diffuse = self.bsdf.eval(context, self.si, wo, active & ~self.every)
+        cosine = mi.Frame3f.cos_theta(wo)
+        diffuse = dr.minimum(diffuse, self.most * dr.abs(cosine) * dr.inv_pi)
+        share = dr.select(self.every | (diffuse >= value), 1, diffuse / value)
+        return dr.select(mi.Frame3f.cos_theta(self.si.wi) * cosine > 0, share, 0)
+
+    def scattered(self, lobe: mi.Float, bs: mi.BSDFSample3f, weight: mi.Spectrum) -> Scattered:
+        """A direction that the material has sampled, by the random number ``lobe`` among others.
 
         Broken meshes have shading normals that are no numbers. Rays along such hit nothing, as if
         they had left the scene: the sky would shine into closed rooms.
         """
-        weight = dr.select(dr.squared_norm(si.to_world(bs.wo)) > 0, weight, 0)
+        weight = dr.select(dr.squared_norm(self.si.to_world(bs.wo)) > 0, weight, 0)
         specular = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        share = self.wide_share(bs.wo, weight * bs.pdf, ~specular)
+        share = dr.select(specular, 0, share)
         # Any random bits do to tell which lobe a direction is of.
         u = unit(mix(dr.reinterpret_array(mi.UInt32, bs.wo.x)))
-        wide = (u < wide_share(bsdf, si, bs.wo, bs.pdf)) & ~specular
-        return Scattered(bs, weight, specular, wide)
+        chance = mean_channel(share * weight) / mean_channel(weight)
+        wide = u < chance
+        part = dr.select(wide, share / chance, (1 - share) / (1 - chance))
+        weight = dr.select(dr.max(weight) > 0, weight * part, 0)
+        return Scattered(bs, weight, specular, wide, lobe)
 
 
 @dr.syntax
 def choose_lobes(
-    bsdf: mi.BSDFPtr,
-    si: mi.SurfaceInteraction3f,
+    lobes: Lobes,
+    first: Scattered,
     sampler: mi.Sampler,
     active: mi.Bool,
     residual: mi.Bool,
 ) -> tuple[mi.Spectrum, Scattered]:
-    """Sample a material ``LOBE_CHOICES`` times, stratified over its lobes.
+    """Sample a material ``LOBE_CHOICES`` times, stratified over its lobes; ``first`` is a sample.
 
     Returns the weight [1] of the wide lobes, for which the cache stands, and one direction for all
     that it can't stand for. Where a ``residual`` is to be estimated, that may be one of a wide
@@ -112,12 +139,8 @@ def choose_lobes(
     bs = dr.zeros(mi.BSDFSample3f)
     wide, i, chances = mi.Bool(False), mi.UInt32(0), mi.Float(0)
     active = mi.Bool(active)
-    u = sampler.next_1d()
-    while dr.hint(active, exclude=[bsdf, si, residual], label="Choose lobes"):
-        lobe = (mi.Float(i) + u) / count
-        one = Scattered.of(
-            bsdf, si, *bsdf.sample(mi.BSDFContext(), si, lobe, sampler.next_2d(), active)
-        )
+    one = dr.copy(first)
+    while dr.hint(active, exclude=[lobes, residual], label="Choose lobes"):
         cached += dr.select(one.wide, one.weight, 0)
         chance = dr.select(one.wide, dr.select(residual, mi.Float(1), 0), count - 1)
         chance = dr.select(dr.max(one.weight) > 0, chance, 0)
@@ -128,5 +151,9 @@ def choose_lobes(
         weight = dr.select(taken, one.weight / chance, weight)
         i += 1
         active &= i < count
+        lobe = one.lobe + 1 / count
+        lobe -= dr.floor(lobe)
+        sample = lobes.bsdf.sample(mi.BSDFContext(), lobes.si, lobe, sampler.next_2d(), active)
+        one = lobes.scattered(lobe, *sample)
     specular = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-    return cached / count, Scattered(bs, weight * chances / count, specular, wide)
+    return cached / count, Scattered(bs, weight * chances / count, specular, wide, first.lobe)

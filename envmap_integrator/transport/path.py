@@ -158,14 +158,13 @@ def direct_light(
         # Camera hits get several; further on one more sample of the pixel serves better.
         n = dr.select(path.depth == 0, mi.UInt32(rules.shadow_samples), mi.UInt32(1))
         light = sample_emitters(scene, lookup.emitters, vertex, share, sampler, n, active)
-        bs, weight = vertex.bsdf.sample(
-            mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d(), vertex.hit
-        )
+        lobe = sampler.next_1d()
+        bs, weight = vertex.bsdf.sample(mi.BSDFContext(), si, lobe, sampler.next_2d(), vertex.hit)
     else:
-        light, bs, weight = sample_with_emitter(
+        light, lobe, bs, weight = sample_with_emitter(
             scene, lookup.emitters, vertex, share, sampler, active
         )
-    return light, Scattered.of(vertex.bsdf, si, bs, weight)
+    return light, vertex.lobes.scattered(lobe, bs, weight)
 
 
 def scatter(

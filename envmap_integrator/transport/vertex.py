@@ -11,6 +11,7 @@ from ..lookup.far_field import Cube
 from ..lookup.lookup import Lookup
 from ..lookup.patches import Cell
 from ..system.ray_counts import Ray, count
+from .lobes import Lobes
 
 
 @dataclass
@@ -24,6 +25,7 @@ class Vertex:
     cell               large cell of the coarse mesh
     emitter_row        of the choice among emitters there
     cube               bounds secondary rays from it; None without maps
+    lobes              of its material
     """
 
     si: mi.SurfaceInteraction3f
@@ -35,6 +37,7 @@ class Vertex:
     cell: Cell
     emitter_row: mi.UInt32
     cube: Cube | None
+    lobes: Lobes
 
     @staticmethod
     def met(lookup: Lookup, si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Bool) -> Vertex:
@@ -48,7 +51,8 @@ class Vertex:
         cell = lookup.patches.locate(si.p, normal, object_id, mapped)
         row = lookup.emitters.row(cell.index, cell.found)
         cube = None if far_field is None else far_field.cube(cell.index, si.p, cell.found)
-        return Vertex(si, bsdf, hit, smooth, normal, object_id, cell, row, cube)
+        lobes = Lobes.of(bsdf, si, hit)
+        return Vertex(si, bsdf, hit, smooth, normal, object_id, cell, row, cube, lobes)
 
 
 @dr.syntax

@@ -52,6 +52,13 @@ def test_a_coat_lets_less_light_in_at_grazing_angles():
     assert found.std() < 0.01 * found.mean()
 
 
+def test_gloss_does_not_count():
+    """What the cache serves of this blend is diffuse: it counts all light alike."""
+    blend = {"type": "blendbsdf", "weight": 0.5, "a": {"type": "diffuse"}}
+    found = factors(blend | {"b": {"type": "roughconductor", "alpha": 0.2}})
+    np.testing.assert_allclose(found, 1, atol=1e-3)
+
+
 def test_each_side_has_its_own():
     sides = {"front": {"type": "diffuse"}, "back": {"type": "plastic"}}
     bsdf = {"type": "twosided"} | sides

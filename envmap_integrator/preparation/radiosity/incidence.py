@@ -15,7 +15,7 @@ import numpy as np
 
 from ...system.jit import R2, mean_channel, upload
 from ...system.spectrum import wavelengths_at
-from ...transport.lobes import Scattered, is_diffuse, single_lobe, wide_share
+from ...transport.lobes import Lobes, is_diffuse, single_lobe
 from ..coarse_mesh.surface_points import SurfacePoints
 
 #: Steps of the squared cosine, all of which as much of an even illumination comes from.
@@ -70,16 +70,12 @@ def _reflected(materials: np.ndarray) -> np.ndarray:
     si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
     si.uv, si.wavelengths = mi.Point2f(v, u), wavelengths_at(u)
     side = dr.select(material % 2 == 0, mi.Float(1), -1)
-    si.wi = mi.Vector3f(sine * dr.cos(azimuth), sine * dr.sin(azimuth), side * cosine)
+    w = mi.Vector3f(sine * dr.cos(azimuth), sine * dr.sin(azimuth), side * cosine)
+    place = mi.Point2f((mi.Float(k) + 0.5) / mi.Float(samples_), mi.radical_inverse_2(k, 1))
+    si.wi = side * mi.warp.square_to_cosine_hemisphere(place)
 
-    # ---- What it reflects ----
-    lobe = (mi.Float(k) + 0.5) / mi.Float(samples_)
-    place = mi.Point2f(v, mi.radical_inverse_2(k, 1))
-    bs, weight = bsdf.sample(mi.BSDFContext(), si, lobe, place)
-    scattered = Scattered.of(bsdf, si, bs, weight)
-    # What the cache stands for is asked from where it's looked at.
-    w, si.wi = mi.Vector3f(si.wi), bs.wo
-    wide = wide_share(bsdf, si, w, bsdf.pdf(mi.BSDFContext(), si, w))
-    reflected = dr.select(scattered.specular, 0, wide * mean_channel(scattered.weight))
+    # ---- What it reflects, to where it's looked at from ----
+    value = bsdf.eval(mi.BSDFContext(), si, w)
+    reflected = mean_channel(Lobes.of(bsdf, si, True).wide_share(w, value) * value) / cosine
     reflected = dr.block_sum(dr.select(dr.isfinite(reflected), reflected, 0), samples).numpy()
     return reflected.reshape(len(materials), STEPS).astype(np.float64)
