@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from unittest.mock import patch
 
@@ -14,7 +14,7 @@ import mitsuba as mi
 from compare.scenes import HYBRID, Subject
 from envmap_integrator.lookup.far_field import FarField
 from envmap_integrator.lookup.patches import Patches
-from envmap_integrator.transport import direct_light, lobes
+from envmap_integrator.transport.lobes import Lobes
 
 FINEST = -32.0
 """``mip_bias`` with which every look-up reads the finest level."""
@@ -57,19 +57,14 @@ def patches_unblended() -> AbstractContextManager:
     return patch.object(Patches, "find", find_own)
 
 
-@contextmanager
-def only_diffuse_is_wide() -> Iterator[None]:
-    """Irradiance stands for no lobe but those that are diffuse; all others are traced on."""
-    wide_share = lobes.wide_share
+def only_diffuse_is_wide() -> AbstractContextManager:
+    """Irradiance stands for no material with gloss; of those, all is traced on."""
+    wide_share = Lobes.wide_share
 
-    def of_diffuse(bsdf, si, wo, pdf):
-        return dr.select(lobes.only_wide(bsdf), wide_share(bsdf, si, wo, pdf), 0)
+    def of_diffuse(self, wo, value, active=True):
+        return dr.select(self.every, wide_share(self, wo, value, active), 0)
 
-    with (
-        patch.object(lobes, "wide_share", of_diffuse),
-        patch.object(direct_light, "wide_share", of_diffuse),
-    ):
-        yield
+    return patch.object(Lobes, "wide_share", of_diffuse)
 
 
 # ---------------------- Variants ----------------------

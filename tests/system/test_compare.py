@@ -212,8 +212,8 @@ def test_replaced_approximations_are_put_back():
     """Outside their contexts nothing is replaced, not even after an error."""
 
     def replaceable():
-        far_field, lobes = variants.FarField, variants.lobes
-        return far_field.eval, far_field._inverse_distance, variants.Patches.find, lobes.wide_share
+        far_field, wide_share = variants.FarField, variants.Lobes.wide_share
+        return far_field.eval, far_field._inverse_distance, variants.Patches.find, wide_share
 
     before = replaceable()
     for variant in variants.variants(patches=256, finer=4).values():
