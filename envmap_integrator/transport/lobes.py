@@ -98,7 +98,8 @@ class Lobes:
         diffuse = self.bsdf.eval(context, self.si, wo, active & ~self.every)
         cosine = mi.Frame3f.cos_theta(wo)
         diffuse = dr.minimum(diffuse, self.most * dr.abs(cosine) * dr.inv_pi)
-        share = dr.select(self.every | (diffuse >= value), 1, diffuse / value)
+        all_of_it = self.every | (diffuse >= value)
+        share = mi.Spectrum(dr.select(all_of_it, mi.Spectrum(1), diffuse / value))
         return dr.select(mi.Frame3f.cos_theta(self.si.wi) * cosine > 0, share, 0)
 
     def scattered(self, lobe: mi.Float, bs: mi.BSDFSample3f, weight: mi.Spectrum) -> Scattered:
