@@ -6,6 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from envmap_integrator.preparation.coarse_mesh.surface_points import in_steps
 from envmap_integrator.preparation.coarse_mesh.views import (
     UNKNOWN,
     Service,
@@ -26,6 +27,11 @@ def test_a_view_is_named_by_where_it_looks():
     parameters["x_fov"] = 30.0
     parameters.update()
     assert view_name(here) != view_name(again)
+
+
+def test_a_sensor_may_see_but_one_place():
+    """The sphere around what its walks have found has some width then."""
+    assert 0 < in_steps(0.0) < in_steps(1e-9)
 
 
 def test_a_view_of_the_same_room_is_served():

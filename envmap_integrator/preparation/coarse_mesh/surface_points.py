@@ -81,7 +81,7 @@ class SurfacePoints:
     def extent(self) -> float:
         """Diagonal of the box that holds most points, of walks if there are any; in steps."""
         low, high = self._most
-        return in_steps(max(float(np.linalg.norm(high - low)), 1e-30))
+        return in_steps(float(np.linalg.norm(high - low)))
 
     @cached_property
     def corner(self) -> np.ndarray:
@@ -284,9 +284,12 @@ def _usual(position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def in_steps(length: float, up: bool = False) -> float:
-    """A length above 0, rounded: what is told from points at random, or by where something that
-    moves happens to be, would change all patches with every frame of an animation."""
-    octaves = EXTENT_STEPS * math.log2(length) + 0.2764
+    """A length, rounded, and above 0 where all is at one place.
+
+    What is told from points at random, or by where something that moves happens to be, would change
+    all patches with every frame of an animation.
+    """
+    octaves = EXTENT_STEPS * math.log2(max(length, 1e-30)) + 0.2764
     return 2 ** ((math.ceil(octaves) if up else round(octaves)) / EXTENT_STEPS)
 
 
