@@ -16,7 +16,7 @@ from ..system.ray_counts import Ray, count, count_secondary
 from .direct_light import mis_weight, sample_emitters, sample_with_emitter
 from .ending import Service, end_in_cache, record_end, serve
 from .far import Met, look_up_far, near_alone
-from .lobes import Scattered, only_wide
+from .lobes import Scattered
 from .rules import PathRules
 from .state import Path, PathEnd, PathStart
 from .vertex import Vertex, skip_emitters
@@ -153,7 +153,7 @@ def direct_light(
 ) -> tuple[mi.Spectrum, Scattered]:
     """Direct light [W/m²/sr] by shadow rays, and the direction that the material has sampled."""
     share, si = service.share, vertex.si
-    active = vertex.smooth & ~(share.lit & only_wide(vertex.bsdf))
+    active = vertex.smooth & ~(share.lit & vertex.lobes.every)
     if rules.shadow_samples > 1:
         # Camera hits get several; further on one more sample of the pixel serves better.
         n = dr.select(path.depth == 0, mi.UInt32(rules.shadow_samples), mi.UInt32(1))
