@@ -14,6 +14,7 @@ import numpy as np
 from distributed import Client
 
 from ..imaging.film import Sums, n_pixels_of, pixel_ranges
+from ..lookup.irradiance_cache import IrradianceCache
 from ..preparation.baked_state import BakedState
 from ..system.interrupt import interruptible
 from ..system.jit import upload
@@ -130,15 +131,16 @@ def render_job(
 def _prepared(client: Client, scene: mi.Scene, views: Sequence[View], spp: int) -> list[_Frame]:
     """Views with their baked states, which the workers get."""
     frames = []
-    known: dict[int, tuple[BakedState, bytes]] = {}
+    known: dict[int, tuple[IrradianceCache, bytes]] = {}
     for view in views:
         with view.of(scene) as sensor:
             samples = spp or sensor.sampler().sample_count()
             baked = scene.integrator().prepare(scene, sensor, samples)
             n_pixels = n_pixels_of(sensor.film())
-        if id(baked) not in known:
-            known[id(baked)] = baked, send_state(client, baked)
-        frames.append(_Frame(view, samples, n_pixels, known[id(baked)][1]))
+        cache = baked.cache  # States of views that share one differ in nothing that renders read.
+        if id(cache) not in known:
+            known[id(cache)] = cache, send_state(client, baked)
+        frames.append(_Frame(view, samples, n_pixels, known[id(cache)][1]))
     return frames
 
 

@@ -108,7 +108,7 @@ def _values(
             case "indirect_irradiance":
                 return cache.rgb(2 * patch.index + 1, patch.found)
             case "irradiance_error":
-                return (dr.gather(mi.Float, cache.error, patch.index, patch.found),)
+                return (dr.gather(mi.Float, cache.error, 2 * patch.index, patch.found),)
             case "cluster":
                 if vertex.cube is None:
                     return (mi.Float(0),) * 3

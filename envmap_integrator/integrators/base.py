@@ -7,6 +7,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -29,11 +30,12 @@ from ..imaging.film import (
 from ..imaging.progress_file import Progress, planned_samples, progress_of, stored_progress
 from ..imaging.progressive import Improving, Renderer, improve
 from ..lookup.far_field import FarField
+from ..lookup.irradiance_cache import IrradianceCache
 from ..lookup.lookup import Lookup
 from ..preparation.baked_state import BakedState, Settings, StateKey, load
-from ..preparation.coarse_mesh.views import service, view_name
 from ..preparation.pipeline import prepare
 from ..preparation.scene_state import SceneState, SceneStates
+from ..preparation.views import service, view_name
 from ..system.checks import check_film, check_not_frozen, check_scene, check_variant
 from ..system.interrupt import interruptible
 from ..system.parameters import Parameters
@@ -194,37 +196,41 @@ class CachedIntegrator(mi.SamplingIntegrator):
         if (settings, name) not in self._prepared:
             state = self._that_serves(scene, now, settings, view)
             if state is None:
-                state = self._make(scene, now, key, settings, sensors)
-                for served in state.views:
-                    self._keep(settings, served, state)
-            if self.cache_file and not _serves(state, scene, now, view):
+                made = self._make(scene, now, key, settings, sensors)
+                for served in made.views:
+                    self._keep(settings, served, made)
+                state = _serving(made, scene, now, view)
+            if state is None:
                 raise ValueError(
                     f'{self.owner}: "cache_file" {self.cache_file} was made for other views than '
                     "this sensor's; make it again with envmap-render bake, with this sensor in the "
                     "scene"
                 )
+            self._warn_of_error(state)
             self._keep(settings, name, state)
         return now, self._prepared[settings, name]
 
     def _keep(self, settings: Settings, view: str, state: BakedState) -> None:
-        """Remember which state serves a view, and forget the oldest of many states."""
+        """Remember which state serves a view, and forget the oldest of many caches."""
         self._prepared[settings, view] = state
-        states = list({id(state): state for state in self._prepared.values()}.values())
-        for old in states[:-MOST_STATES]:
-            self._prepared = {k: s for k, s in self._prepared.items() if s is not old}
+        caches = list({id(s.cache): s.cache for s in self._prepared.values()}.values())
+        for old in caches[:-MOST_STATES]:
+            self._prepared = {k: s for k, s in self._prepared.items() if s.cache is not old}
 
     def _that_serves(self, scene, now, settings, view) -> BakedState | None:
         """What has been prepared for other views, if it serves this one too."""
-        states = {id(s): s for (its, _), s in self._prepared.items() if its == settings}
-        return next((s for s in states.values() if _serves(s, scene, now, view)), None)
+        states = {id(s.cache): s for (its, _), s in self._prepared.items() if its == settings}
+        serving = (_serving(state, scene, now, view) for state in states.values())
+        return next((state for state in serving if state), None)
 
     def _make(self, scene, now, key, settings, sensors) -> BakedState:
         if self.cache_file:
             owner = f'{self.owner}: "cache_file"'
-            state = load(self.cache_file, key, owner, len(scene.emitters()))
-        else:
-            with interruptible(), dr.suspend_grad():
-                state = prepare(scene, now, key.settings, settings, sensors, self.owner)
+            return load(self.cache_file, key, owner, len(scene.emitters()))
+        with interruptible(), dr.suspend_grad():
+            return prepare(scene, now, key.settings, settings, sensors, self.owner)
+
+    def _warn_of_error(self, state: BakedState) -> None:
         if state.relative_error > DOUBTFUL:
             mi.Log(
                 mi.LogLevel.Warn,
@@ -232,7 +238,6 @@ class CachedIntegrator(mi.SamplingIntegrator):
                 f"bright or too dark by {2 * state.relative_error:.1%} (two standard errors); take "
                 'more samples per pixel, or raise "patch_samples"',
             )
-        return state
 
     # ---------------------- Rendering ----------------------
 
@@ -375,16 +380,18 @@ class CachedIntegrator(mi.SamplingIntegrator):
     ) -> tuple[Lookup, Recorder]:
         """What paths look up, and what is recorded of renders that do."""
         maps = self.maps_for(scene, now, baked, spp)
-        return now.lookup(baked, maps), self._recorder_of(now, baked, maps)
+        return now.lookup(baked, maps), self._recorder_of(now, baked.cache, maps)
 
-    def _recorder_of(self, now: SceneState, baked: BakedState, maps: FarField | None) -> Recorder:
+    def _recorder_of(
+        self, now: SceneState, cache: IrradianceCache, maps: FarField | None
+    ) -> Recorder:
         """The same one as long as nothing in the scene has been replaced."""
         self._recorders = [r for r in self._recorders if r.about[0] is now][-MOST_STATES:]
         for recorder in self._recorders:
-            if recorder.is_about(now, baked, maps):
+            if recorder.is_about(now, cache, maps):
                 return recorder
         possible = not now.content.in_python
-        self._recorders.append(Recorder(now, baked, maps, possible=possible))
+        self._recorders.append(Recorder(now, cache, maps, possible=possible))
         return self._recorders[-1]
 
     def render_forward(self, scene, params, sensor=0, seed=0, spp=0) -> None:
@@ -521,12 +528,15 @@ class GatheringIntegrator(CachedIntegrator):
         return [*found.aovs, *(c for x in indirect for c in rgb(seen(x, wavelengths)))]
 
 
-def _serves(state: BakedState, scene: mi.Scene, now: SceneState, view: mi.Sensor | None) -> bool:
+def _serving(
+    state: BakedState, scene: mi.Scene, now: SceneState, view: mi.Sensor | None
+) -> BakedState | None:
+    """The state for a view, with the error of its picture; None if it doesn't serve that."""
     if view is None or view_name(view) in state.views:
-        return True
+        return state
     with dr.suspend_grad():
-        found = service(scene, now.ids, state.cache.patches, view)
-    return found.suffices(state.service)
+        found = service(scene, now.ids, state.cache, state.size_error, view)
+    return replace(state, relative_error=found.error) if found.suffices(state.service) else None
 
 
 def camera_samples(sensor: mi.Sensor | None, spp: int) -> int:

@@ -20,8 +20,8 @@ class IrradianceCache:
     table     [2 * P * C]  W/m²: row 2p total, row 2p + 1 indirect irradiance of patch p, by C
                            colour channels. Of n packets of wavelengths, row 2 (n p + packet) and
                            the next
-    error     [P]          W/m²: standard error of total irradiance, mean of the colour channels;
-                           None while the cache is being made
+    error     [2 * P]      W/m²: standard error of the irradiance in rows 2p and 2p + 1, mean of the
+                           colour channels; None while the cache is being made
     hue       [C]          typical spectrum of the patches' indirect irradiance, with a mean of 1;
                            None without wavelengths, and while the cache is being made
     """

@@ -20,8 +20,8 @@ from ..system.fingerprint import difference
 from ..system.jit import opaque_point, upload
 from ..system.spectrum import n_stored
 from ..system.storage import StorageError, Stored, read, write
-from .coarse_mesh.views import Service
 from .maps.clusters import ClusterRequest
+from .views import Service
 
 #: Patches that a render is worth, at least and at most, and camera samples for which there is one.
 #: Renders of nearly the same size get the same: there are few steps of the size in between.
@@ -114,9 +114,10 @@ class BakedState:
     emitter_table      [R * L * 4]  probabilities of the emitters (``EmitterChoice.table``),
     emitter_rows       [C]          ... and which row is each large cell's
     views              names (``view_name``) of the sensors that it was made for,
-    service            ... and what the coarse mesh does for them
+    service            ... and what it does for them
     relative_error     [1]          error of the brightness of their pictures, of the worst, that
-                                    comes from the noise of the cache and the size of the patches
+                                    comes from the noise of the cache and the size of the patches;
+                                    of another view's, if it's the state for that
     size_error         [1]          ... from the latter alone, as far as it's beyond doubt
     maps               one cube map per cluster
     cluster_of_cell    cluster index of each large cell, ``len(maps)`` where there is none
@@ -227,7 +228,7 @@ def _prepared(stored: Stored, key: StateKey, n_emitters: int, but: Collection[st
         use_objects=stored.flag("use_objects"),
     )
     table = values("irradiance", "Y", np.float32, 2 * n_patches * n_channels)
-    error = values("irradiance_error", "Y", np.float32, n_patches)
+    error = values("irradiance_error", "Y", np.float32, 2 * n_patches)
 
     # What kernels look up has to be there: they don't check.
     n_sources = stored.integer("sources", 4 * n_emitters)
@@ -255,7 +256,7 @@ def _prepared(stored: Stored, key: StateKey, n_emitters: int, but: Collection[st
         upload(mi.Float, sources),
         upload(mi.UInt32, rows),
         tuple(stored.texts("views")),
-        Service(service.number("found"), service.number("patches")),
+        Service(*(service.number(name) for name in ("found", "patches", "error"))),
         stored.number("relative_error"),
         stored.number("size_error"),
         maps,

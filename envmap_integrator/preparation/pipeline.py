@@ -20,7 +20,6 @@ from .coarse_mesh.build import build_mesh
 from .coarse_mesh.patch_points import only_standing
 from .coarse_mesh.spaces import find_spaces, separate
 from .coarse_mesh.surface_points import scatter_points
-from .coarse_mesh.views import usual_service, view_name
 from .maps.bake import bake_maps
 from .maps.clusters import (
     benefit,
@@ -34,6 +33,7 @@ from .radiosity.direct_light import choose_emitters, survey_direct_light
 from .radiosity.evenness import sort_out_uneven
 from .radiosity.irradiance import solve_irradiance
 from .scene_state import SceneState
+from .views import usual_service, view_name
 
 #: How often patches that turn out to be too large are halved.
 MOST_DIVISIONS = 2
@@ -113,7 +113,7 @@ def prepare(
         choice.table,
         choice.row_of_cell,
         tuple(map(view_name, sensors)),
-        usual_service(mesh),
+        usual_service(mesh, solution.relative_error),
         solution.relative_error,
         solution.size_error,
         maps,

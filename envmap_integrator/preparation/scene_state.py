@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 
+from ..lookup.cube_map import CubeMap
 from ..lookup.emitter_choice import EmitterChoice, Emitters
 from ..lookup.far_field import FarField, far_field
 from ..lookup.ids import ObjectIds
@@ -27,7 +28,7 @@ class SceneState:
     def __init__(self, scene: mi.Scene, content: SceneContent, fingerprint: str):
         self.content, self.fingerprint = content, fingerprint
         self.ids, self.emitters = ObjectIds.of(scene), Emitters.of(scene)
-        self._maps: tuple[BakedState, tuple, FarField] | None = None
+        self._maps: tuple[tuple[CubeMap, ...], tuple, FarField] | None = None
 
     def lookup(self, baked: BakedState, maps: FarField | None) -> Lookup:
         """What paths look up in the scene, once it has been prepared."""
@@ -47,9 +48,9 @@ class SceneState:
         if not baked.maps:
             return None
         settings = n_samples, mip_bias, corrected, map_mirrors
-        if self._maps is None or self._maps[0] is not baked or self._maps[1] != settings:
+        if self._maps is None or self._maps[0] is not baked.maps or self._maps[1] != settings:
             found = far_field(scene, baked.maps, baked.cluster_of_cell, *settings)
-            self._maps = baked, settings, found
+            self._maps = baked.maps, settings, found
         return self._maps[2]
 
 

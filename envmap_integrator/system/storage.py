@@ -26,7 +26,7 @@ from .memory import free_memory
 
 #: EXR attribute that holds our metadata, as JSON.
 ATTRIBUTE = "envmap_integrator"
-FORMAT = 8
+FORMAT = 9
 
 _MAGIC = b"v/1\x01"
 #: The attribute as it lies in a file, within its first bytes; so it began in every format.

@@ -89,7 +89,7 @@ def test_values_are_those_that_are_stored(scene):
     expected = {
         "irradiance": table[2 * index],
         "indirect_irradiance": table[2 * index + 1],
-        "irradiance_error": state.cache.error.numpy()[index][:, None],
+        "irradiance_error": state.cache.error.numpy()[2 * index][:, None],
         "patch": np.where(patch.even.numpy(), 1, UNEVEN)[:, None] * colour,
     }
     assert known.mean() > 0.9

@@ -111,7 +111,7 @@ def test_an_edited_sensor_rebuilds_nothing():
     parameters = mi.traverse(scene)
     parameters["sensor.x_fov"] = 30.0
     parameters.update()
-    assert renderer.prepare(scene) is before
+    assert renderer.prepare(scene).cache is before.cache
 
 
 def test_scenes_of_the_same_content_share_what_is_prepared(scene, hybrid):

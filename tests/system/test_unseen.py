@@ -206,7 +206,7 @@ def test_a_sensor_among_many_is_not_prepared_for_again():
     states = set()
     for x in (-0.6, -0.7, -0.8):
         view = camera(48, 32, origin=(x, -1.7, 1.5), target=(-2.2, 0.6, 0.8))
-        states.add(id(renderer.prepare(scene, mi.load_dict(view), spp=64)))
+        states.add(id(renderer.prepare(scene, mi.load_dict(view), spp=64).cache))
     assert len(states) == 1
 
 
@@ -303,6 +303,23 @@ def caches(monkeypatch):
             monkeypatch.setattr(pipeline, name, seeded)
 
     return choose
+
+
+def test_a_view_is_prepared_for_if_too_little_is_known_of_its_light():
+    """Its walls have patches, as light that is seen has passed them, but few rays have found it."""
+
+    def view(x: float, y: float) -> Description:
+        return camera(24, 18, origin=(0, 2.6, 1.5), target=(x, y, 1.2), fov=75)
+
+    scene, renderer = load(zigzag() | {"sensor": view(0.1, 6)}), hybrid()
+    own = renderer.prepare(scene, spp=16)
+    assert own.relative_error < 0.01
+    beside = renderer.prepare(scene, mi.load_dict(view(0.15, 6)), spp=16)
+    assert beside.cache is own.cache
+    assert beside.relative_error == pytest.approx(own.relative_error, rel=0.5)
+    assert beside.relative_error != own.relative_error
+    back = renderer.prepare(scene, mi.load_dict(view(0.1, 0)), spp=16)
+    assert back.cache is not own.cache and back.relative_error < 0.02
 
 
 @pytest.mark.slow

@@ -98,6 +98,7 @@ def surface_points(position: np.ndarray, normal, object_id=0, seen=1.0) -> Surfa
         np.zeros(len(position), bool),
         np.zeros(len(position), np.uint32),
         np.ones(len(position), np.float32),
+        np.ones(len(position), bool),
         np.zeros(len(position), np.int64),
     )
 

@@ -9,19 +9,24 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from envmap_integrator.lookup.irradiance_cache import IrradianceCache
 from envmap_integrator.preparation.coarse_mesh.patch_points import PatchPoints
+from envmap_integrator.preparation.coarse_mesh.surface_points import walk_from
 from envmap_integrator.preparation.radiosity.coarseness import Coarseness
 from envmap_integrator.preparation.radiosity.gather import block_mean, gather
 from envmap_integrator.preparation.radiosity.incidence import Incidence
 from envmap_integrator.preparation.radiosity.irradiance import solve_irradiance
 from envmap_integrator.preparation.radiosity.noise import TARGET, Noise
 from envmap_integrator.preparation.radiosity.unknowns import Unknowns
+from envmap_integrator.preparation.radiosity.view_error import view_error
 from tests.helpers import Description, at, box, camera, emitting, grey, load, room
-from tests.unit.kit import coarse_mesh
+from tests.unit.kit import CoarseMesh, coarse_mesh
 
 pytestmark = pytest.mark.usefixtures("variant")
 
 BUDGET, SAMPLES = 512, 16
+BEHIND_THE_WALL = {"origin": (1.5, -1.0, 0), "target": (1, 1.5, -1)}
+BEFORE_THE_WALL = {"origin": (-1.5, -1.0, 0), "target": (-1, 1.5, -1)}
 
 
 def behind_a_wall(*sensors: Description) -> mi.Scene:
@@ -31,7 +36,7 @@ def behind_a_wall(*sensors: Description) -> mi.Scene:
     """
     place = at(0.1, 0.4, 0) @ mi.ScalarTransform4f().rotate([0, 1, 0], 90).scale([2.1, 2.1, 1])
     wall = {"type": "rectangle", "to_world": place, "bsdf": {"type": "twosided"} | grey(0.5)}
-    sensors = sensors or (camera(origin=(1.5, -1.0, 0), target=(1, 1.5, -1)),)
+    sensors = sensors or (camera(**BEHIND_THE_WALL),)
     lamp = {"type": "sphere", "center": [-1.8, 1.0, 0], "radius": 0.1} | grey(0) | emitting(50)
     return load(
         {"type": "scene", "walls": box(2.0) | grey(0.5), "wall": wall, "lamp": lamp}
@@ -39,10 +44,18 @@ def behind_a_wall(*sensors: Description) -> mi.Scene:
     )
 
 
-def solutions(scene: mi.Scene, more_rays: int = 0, count: int = 16, budget=BUDGET, samples=SAMPLES):
+def solutions(
+    scene: mi.Scene,
+    more_rays: int = 0,
+    count: int = 16,
+    budget=BUDGET,
+    samples=SAMPLES,
+    view: mi.Sensor | None = None,
+):
     """Brightness of what the sensor sees, and the stated error, of caches by other rays.
 
-    What is seen gathers light by rays of its own, always the same, which end in the cache.
+    What is seen gathers light by rays of its own, always the same, which end in the cache. A
+    ``view`` is seen instead of the sensor that the caches are made for.
     """
     coarse = coarse_mesh(scene, budget, points_per_patch=32)
     lookup = coarse.lookup()
@@ -50,8 +63,14 @@ def solutions(scene: mi.Scene, more_rays: int = 0, count: int = 16, budget=BUDGE
     patches = np.arange(len(members.patches))
     incidence = Incidence(coarse.points)
     rays = gather(scene, lookup, Unknowns(members), incidence, patches, 1024, seed=7)
-    seen = (coarse.points.seen > 0) & (coarse.points.bounce == 0) & (coarse.patch_of_point >= 0)
-    share = np.bincount(coarse.patch_of_point[seen], minlength=coarse.patches.count)
+    if view is None:
+        points, patch = coarse.points, coarse.patch_of_point
+    else:
+        points = walk_from(scene, coarse.object_ids, view, 4096, 16)
+        index, _, found = coarse.find(points)
+        patch = np.where(found, index.astype(int), -1)
+    seen = (points.seen > 0) & (points.bounce == 0) & (patch >= 0)
+    share = np.bincount(patch[seen], minlength=coarse.patches.count)
     share = share[members.patches] / share.sum()
     own = (rays.direct + rays.escaped).numpy().mean(axis=0)
 
@@ -68,8 +87,17 @@ def solutions(scene: mi.Scene, more_rays: int = 0, count: int = 16, budget=BUDGE
         arriving = rays.weight * dr.gather(mi.Spectrum, solution.cache.table, rays.row)
         arriving = block_mean(dr.mean(arriving), rays.samples).numpy()
         brightness.append(share @ (own + arriving))
-        stated.append(solution.noise.chance)
+        chance = solution.noise.chance
+        stated.append(error_of(view, coarse, solution.cache) if view else chance)
     return np.array(brightness), np.array(stated)
+
+
+def error_of(view: mi.Sensor, coarse: CoarseMesh, cache: IrradianceCache) -> float:
+    """What ``view_error`` states for a view."""
+    points = walk_from(coarse.scene, coarse.object_ids, view, 4096, 16)
+    place = points.places()
+    cell = cache.patches.locate(*place)
+    return view_error(points, cell, cache.patches.find(*place, cell), cache)
 
 
 @pytest.mark.parametrize("scene", [lambda: load(room()), behind_a_wall], ids=["room", "gap"])
@@ -77,6 +105,25 @@ def test_caches_scatter_as_they_state(scene):
     brightness, stated = solutions(scene())
     scatter = brightness.std(ddof=1) / brightness.mean()
     assert scatter / 2 < stated.mean() < 2 * scatter
+
+
+def test_caches_scatter_as_is_stated_of_another_view():
+    """Which hangs on what the cache's own view hardly looks at."""
+    scene = behind_a_wall(camera(**BEFORE_THE_WALL))
+    brightness, stated = solutions(scene, view=mi.load_dict(camera(**BEHIND_THE_WALL)))
+    scatter = brightness.std(ddof=1) / brightness.mean()
+    assert scatter / 2 < stated.mean() < 2 * scatter
+    _, of_own_view = solutions(scene)
+    assert stated.mean() > 2 * of_own_view.mean()
+
+
+@pytest.mark.parametrize("scene", [lambda: load(room()), behind_a_wall], ids=["room", "gap"])
+def test_walks_state_what_gather_rays_do(scene):
+    coarse = coarse_mesh(scene(), 1024, points_per_patch=32)
+    solution = coarse.solution(32)
+    (sensor,) = coarse.scene.sensors()
+    by_walks = error_of(sensor, coarse, solution.cache)
+    assert 0.6 < by_walks / solution.noise.chance < 1.4
 
 
 def test_irradiance_scatters_as_each_patch_states():
@@ -88,7 +135,7 @@ def test_irradiance_scatters_as_each_patch_states():
         for seed in range(24)
     ]
     scatter = np.std([cache.mean_channel()[::2] for cache in caches], axis=0, ddof=1)
-    stated = np.sqrt(np.mean([np.square(cache.error.numpy()) for cache in caches], axis=0))
+    stated = np.sqrt(np.mean([np.square(cache.error.numpy()[::2]) for cache in caches], axis=0))
     used = scatter > 0
     assert used.sum() > BUDGET / 4 and not stated[~used].any()
     assert 0.5 < np.median(scatter[used] / stated[used]) < 1.1
@@ -115,7 +162,7 @@ def noise(relative_error: float) -> Noise:
         coarseness=Coarseness(bias=0.0, doubt=0.0, steep=np.zeros(1, dtype=bool), steep_bias=0.0),
         scatter=np.array([1.0, 2.0, 3.0, 0.0]) * relative_error,
         stake=np.array([1.0, 1.0, 1.0, 4.0]),
-        of_irradiance=np.zeros(4),
+        of_irradiance=np.zeros((4, 2)),
         count=np.ones(4, dtype=np.int64),
         escaped_share=np.zeros(4),
     )

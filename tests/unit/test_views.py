@@ -1,4 +1,4 @@
-"""Which views a coarse mesh serves."""
+"""Which views a state serves."""
 
 from __future__ import annotations
 
@@ -7,17 +7,22 @@ import numpy as np
 import pytest
 
 from envmap_integrator.preparation.coarse_mesh.surface_points import in_steps
-from envmap_integrator.preparation.coarse_mesh.views import (
-    UNKNOWN,
+from envmap_integrator.preparation.radiosity.noise import TARGET
+from envmap_integrator.preparation.views import (
+    NO_VIEW,
     Service,
     service,
     usual_service,
     view_name,
 )
-from tests.helpers import box, camera, grey, load, room
-from tests.unit.kit import coarse_mesh, scene_of
+from tests.helpers import box, camera, emitting, grey, load, room
+from tests.unit.kit import CoarseMesh, coarse_mesh, scene_of
 
 pytestmark = pytest.mark.usefixtures("variant")
+
+
+def served(coarse: CoarseMesh, sensor: mi.Sensor) -> Service:
+    return service(coarse.scene, coarse.object_ids, coarse.solve(16), 0.0, sensor)
 
 
 def test_a_view_is_named_by_where_it_looks():
@@ -36,41 +41,53 @@ def test_a_sensor_may_see_but_one_place():
 
 def test_a_view_of_the_same_room_is_served():
     coarse = coarse_mesh(load(room()), 1024, points_per_patch=32)
-    usual = usual_service(coarse)
+    usual = usual_service(coarse, 0.01)
     assert usual.found > 0.9 and usual.patches > 100
     for origin in ((0.5, -1.7, 0.6), (-1.5, 1.5, 1.0)):
         other = mi.load_dict(camera(origin=origin))
-        found = service(coarse.scene, coarse.object_ids, coarse.patches, other)
+        found = served(coarse, other)
         assert found.suffices(usual)
 
 
 def test_a_view_of_another_room_is_not():
     far = box(2.0) | {"to_world": mi.ScalarTransform4f().translate([10, 0, 0]).scale(2)} | grey(0.5)
     coarse = coarse_mesh(load(room(other=far)), 1024, points_per_patch=32)
-    usual = usual_service(coarse)
+    usual = usual_service(coarse, 0.01)
     other = mi.load_dict(camera(origin=(10, -1.8, 0.4), target=(10, 0.5, -1)))
-    found = service(coarse.scene, coarse.object_ids, coarse.patches, other)
+    found = served(coarse, other)
     assert found.found < 0.1
     assert not found.suffices(usual)
 
 
-def test_patches_too_large_for_a_view_do_not_serve_it():
-    assert Service(0.95, 500).suffices(Service(0.96, 1000))
-    assert not Service(0.95, 200).suffices(Service(0.96, 1000))
-    assert not Service(0.90, 1000).suffices(Service(0.96, 1000))
+@pytest.mark.parametrize(
+    ("found", "patches", "error", "suffices"),
+    [
+        (0.95, 500, 0.01, True),
+        (0.95, 200, 0.01, False),
+        (0.90, 1000, 0.01, False),
+        (0.96, 1000, 0.014, True),
+        (0.96, 1000, 0.016, False),
+    ],
+)
+def test_it_must_serve_a_view_about_as_well(found, patches, error, suffices):
+    assert Service(found, patches, error).suffices(Service(0.96, 1000, 0.01)) == suffices
+
+
+def test_small_errors_are_all_small_enough():
+    assert Service(1.0, 1000, TARGET).suffices(Service(1.0, 1000, 0.0))
 
 
 def test_a_mesh_made_for_no_view_serves_none():
-    coarse = coarse_mesh(scene_of(box(2.0) | grey(0.5)), 256)
-    usual = usual_service(coarse)
-    assert usual == UNKNOWN
+    coarse = coarse_mesh(scene_of(box(2.0) | grey(0.5), box(0.1) | emitting(1)), 256)
+    usual = usual_service(coarse, 0.01)
+    assert usual == Service(1.0, NO_VIEW, 0.01)
     sensor = mi.load_dict(camera())
-    assert not service(coarse.scene, coarse.object_ids, coarse.patches, sensor).suffices(usual)
+    assert not served(coarse, sensor).suffices(usual)
 
 
 def test_a_view_that_asks_for_nothing_is_served():
     coarse = coarse_mesh(load(room()), 256)
     away = mi.load_dict(camera(origin=(0, -30, 0), target=(0, -60, 0)))
-    found = service(coarse.scene, coarse.object_ids, coarse.patches, away)
-    assert found.suffices(usual_service(coarse))
-    assert np.isinf(found.patches)
+    found = served(coarse, away)
+    assert found.suffices(usual_service(coarse, 0.01))
+    assert np.isinf(found.patches) and found.error == 0

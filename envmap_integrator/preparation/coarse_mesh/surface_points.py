@@ -49,8 +49,9 @@ class SurfacePoints:
     seen            [N]     1 + the sensor's index for a point on a walk from it, 0 on a global line
     turned          [N]     whether a bump or normal map turns the shading normal
     bounce          [N]     which hit of its walk or line it is, from 0
-    reflects        [N]     weight with which its walk has gone on, mean of the colour channels; 0
-                            on a line
+    reflects        [N]     weight with which its walk has gone on, of all its bounces so far, mean
+                            of the colour channels; 0 on a line
+    diffuse         [N]     whether it has gone on by a diffuse lobe
     start           [N]     walks of one sensor with the same number start in sight of one place
     """
 
@@ -63,6 +64,7 @@ class SurfacePoints:
     turned: np.ndarray
     bounce: np.ndarray
     reflects: np.ndarray
+    diffuse: np.ndarray
     start: np.ndarray
 
     def __len__(self) -> int:
@@ -200,7 +202,9 @@ def scatter_points(
             ray = _sensor_rays(sensor, numbers)
             start = _starts(scene, sensor, ray.o, batch)
             points.append(
-                _hits_along(scene, object_ids, numbers, ray, wanted, walk=index + 1, start=start)
+                _hits_along(
+                    scene, object_ids, numbers, ray, wanted, WALK_HITS, walk=index + 1, start=start
+                )
             )
         return points
 
@@ -213,18 +217,21 @@ def scatter_points(
     def lines(n_rays, batch):
         numbers = RandomNumbers.of_lanes(1009 * (MAX_BATCHES * seed + batch), n_rays)
         ray, within = _global_lines(spheres, numbers, n_rays)
-        return [_hits_along(scene, object_ids, None, ray, wanted, within=within)]
+        return [_hits_along(scene, object_ids, None, ray, wanted, LINE_HITS, within=within)]
 
     return SurfacePoints.concatenate(points + _enough(lines, count, LINE_HITS))
 
 
 def walk_from(
-    scene: mi.Scene, object_ids: ObjectIds, sensor: mi.Sensor, n_rays: int
+    scene: mi.Scene, object_ids: ObjectIds, sensor: mi.Sensor, n_rays: int, n_hits: int
 ) -> SurfacePoints:
-    """What walks from a sensor meet, as ``scatter_points`` does it."""
+    """What walks of so many hits from a sensor meet, sorted by bounce.
+
+    As ``scatter_points`` does it, but for ``start``: it counts the walks.
+    """
     numbers = RandomNumbers.of_lanes(0, n_rays)
-    ray = _sensor_rays(sensor, numbers)
-    return _hits_along(scene, object_ids, numbers, ray, mi.BSDFFlags.Smooth, walk=1)
+    ray, start = _sensor_rays(sensor, numbers), np.arange(n_rays)
+    return _hits_along(scene, object_ids, numbers, ray, mi.BSDFFlags.Smooth, n_hits, 1, None, start)
 
 
 def _starts(
@@ -348,6 +355,7 @@ def _hits_along(
     numbers: RandomNumbers | None,
     ray: mi.Ray3f,
     wanted: mi.BSDFFlags,
+    n_hits: int,
     walk: int = 0,
     within: mi.Vector4f | None = None,
     start: np.ndarray | None = None,
@@ -356,17 +364,19 @@ def _hits_along(
 
     Points are kept where the BSDF has any of the ``wanted`` flags, and ``within`` a sphere.
     """
-    n_rays, n_hits = dr.width(ray), WALK_HITS if walk else LINE_HITS
+    n_rays = dr.width(ray)
     size = n_hits * n_rays
     positions, normals, shading_normals = (dr.zeros(mi.Float, 3 * size) for _ in range(3))
     object_of_point, material = (dr.zeros(mi.UInt32, size) for _ in range(2))
     reflects = dr.zeros(mi.Float, size)
-    kept, turned = dr.zeros(mi.Bool, size), dr.zeros(mi.Bool, size)
+    kept, turned, diffuse = (dr.zeros(mi.Bool, size) for _ in range(3))
     n_hits_, n_rays_ = dr.opaque(mi.UInt32, n_hits), dr.opaque(mi.UInt32, n_rays)
 
     # Only what changes is part of the loop's state: with more, it would be traced twice.
     origin, line = mi.Point3f(ray.o), ray.d
-    direction, maxt = (mi.Vector3f(ray.d), mi.Float(ray.maxt)) if walk else (None, None)
+    direction, maxt, throughput = (
+        (mi.Vector3f(ray.d), mi.Float(ray.maxt), mi.Spectrum(1)) if walk else (None, None, None)
+    )
     time, wavelengths = ray.time, ray.wavelengths
     index = dr.arange(mi.UInt32, n_rays)
     active = dr.full(mi.Bool, True, n_rays)
@@ -388,6 +398,7 @@ def _hits_along(
             kept,
             turned,
             reflects,
+            diffuse,
         ],
         label="Scatter points",
     ):
@@ -423,14 +434,17 @@ def _hits_along(
             )
             direction = towards = si.to_world(bs.wo)
             maxt = mi.Float(dr.largest(mi.Float))
-            dr.scatter(reflects, mean_channel(weight), index, keep)
+            throughput *= weight
+            dr.scatter(reflects, mean_channel(throughput), index, keep)
+            by_lobe = mi.has_flag(bs.sampled_type, mi.BSDFFlags.DiffuseReflection)
+            dr.scatter(diffuse, by_lobe, index, keep)
             active &= mi.luminance(weight) > 0 if mi.is_rgb else dr.max(weight) > 0
         origin = mi.Point3f(si.spawn_ray(towards).o)
         index += n_rays_
         active &= index < n_hits_ * n_rays_
 
     dr.eval(positions, normals, shading_normals, object_of_point, material)
-    dr.eval(kept, turned, reflects)
+    dr.eval(kept, turned, reflects, diffuse)
     chosen = np.flatnonzero(kept.numpy())
     position, normal, shading_normal = (
         vectors.numpy().reshape(size, 3).take(chosen, axis=0)
@@ -446,5 +460,6 @@ def _hits_along(
         turned.numpy()[chosen],
         (chosen // n_rays).astype(np.uint32),
         reflects.numpy()[chosen],
+        diffuse.numpy()[chosen],
         np.zeros(len(chosen), dtype=np.int64) if start is None else start[chosen % n_rays],
     )

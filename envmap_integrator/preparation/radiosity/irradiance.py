@@ -87,7 +87,9 @@ def solve_irradiance(
     if n_used == 0:  # Nothing but mirrors and glass.
         table = dr.zeros(mi.Float, 2 * n_patches * n_channels)
         no_cell = np.zeros(dr.width(lookup.patches.levels), dtype=bool)
-        cache = IrradianceCache.of(lookup.patches, table, dr.zeros(mi.Float, mesh.patches.count))
+        cache = IrradianceCache.of(
+            lookup.patches, table, dr.zeros(mi.Float, 2 * mesh.patches.count)
+        )
         return Solution(cache, None, np.zeros(mesh.patches.count), no_cell)
 
     incidence = Incidence(mesh.points)
@@ -111,11 +113,12 @@ def solve_irradiance(
         if not wanted.any():
             break
         rank = np.repeat(np.arange(n_used), wanted)
-    patches, (escaped_share, error) = unknowns.members.patches, np.zeros((2, mesh.patches.count))
+    patches, n = unknowns.members.patches, mesh.patches.count
+    escaped_share, error = np.zeros(n), np.zeros((n, 2))
     escaped_share[patches] = unknowns.by_patch(noise.escaped_share).mean(axis=1)
     of_packets = unknowns.by_patch(noise.of_irradiance)
     error[patches] = np.sqrt(np.square(of_packets).sum(axis=1)) / unknowns.packets  # Of their mean.
-    cache = IrradianceCache.of(lookup.patches, cache.table, upload(mi.Float, error))
+    cache = IrradianceCache.of(lookup.patches, cache.table, upload(mi.Float, error.ravel()))
     n_rays = dr.width(rays.row)
     del rays
     give_back(FLOATS_PER_RAY * n_rays)

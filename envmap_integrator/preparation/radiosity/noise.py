@@ -42,8 +42,8 @@ class Noise:
     scatter          [U]  what a single ray of each unknown adds to that error, root mean square
                           over its patch's surroundings
     stake            [U]  share of the picture's brightness that passes through it, likewise
-    of_irradiance    [U]  W/m²: its standard error, by the chance of its rays alone, not of what
-                          they find on other patches
+    of_irradiance    [U, 2]  W/m²: standard error of its total and its indirect irradiance, by the
+                          chance of its rays alone, not of what they find on other patches
     count            [U]  blocks of rays so far
     escaped_share    [U]  see ``Solution``
     """
@@ -124,9 +124,10 @@ def cache_noise(
     block = sum(
         importance * mean[:, None] / samples for importance, mean in zip((t, i), means, strict=True)
     )
-    moments = [0.5 / samples**2 * x for x in (s_s, o_o, s_o)]
+    s_s, o_o, s_o = (0.5 / samples**2 * x for x in (s_s, o_o, s_o))
     within = sum(
-        a * moment[:, None] for a, moment in zip((t * t, i * i, t * i), moments, strict=True)
+        a * moment[:, None]
+        for a, moment in zip((t * t, i * i, t * i), (s_s, o_o, s_o), strict=True)
     )
 
     # ---- By patch: the scatter of its blocks, if there are several, as rays of one are stratified
@@ -146,13 +147,14 @@ def cache_noise(
     def around(values):
         return (np.bincount(cell, values) / np.bincount(cell))[cell]
 
+    own = by_patch @ np.column_stack([s_s + o_o + s_o, o_o])
     escaped, patched = (np.bincount(rank, x * share) for x in (escaped, patched))
     return Noise(
         chance=float(chance),
         coarseness=coarse,
         scatter=np.sqrt(around(variance * count * samples)),
         stake=around(indirect.sum(axis=1) * irradiance),
-        of_irradiance=np.sqrt(np.maximum(by_patch @ sum(moments), 0) / count),
+        of_irradiance=np.sqrt(np.maximum(own, 0) / count[:, None]),
         count=count,
         escaped_share=escaped / np.maximum(escaped + patched, 1e-30),
     )
