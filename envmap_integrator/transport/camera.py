@@ -12,15 +12,11 @@ from ..system.jit import opaque_point
 from ..system.ray_counts import Ray, count
 from .direct_light import WideShare, sample_emitter, sample_emitters
 from .gathered import Gathered
-from .lobes import Lobes, Scattered, is_delta, is_diffuse, single_lobe
+from .lobes import Lobes, Scattered, is_delta, is_diffuse
 from .path import follow, survival_probability
 from .rules import PathRules
 from .state import PathStart, camera_path
 from .vertex import Vertex, skip_emitters
-
-#: Added to the albedo of what has gloss beside its diffuse lobe: the wide part of gloss is light
-#: that the surface reflects however dark it is.
-GLOSS_ALBEDO = 0.04
 
 
 @dataclass
@@ -143,7 +139,7 @@ def split(
         arriving /= rules.secondary_samples
         wide /= rules.secondary_samples
         nearness /= rules.secondary_samples
-    gathered = gathering(scene, lookup, si, vertex.bsdf, wide, nearness, vertex.smooth)
+    gathered = gathering(scene, lookup, vertex, sampler.next_2d(), wide, nearness)
     seen = CameraSample(radiance + arriving, distance, valid, gathered, vertex).scaled(throughput)
     return replace(seen, radiance=seen.radiance + on_mirrors)
 
@@ -190,22 +186,21 @@ def follow_mirrors(
 def gathering(
     scene: mi.Scene,
     lookup: Lookup,
-    si: mi.SurfaceInteraction3f,
-    bsdf: mi.BSDFPtr,
+    vertex: Vertex,
+    u: mi.Point2f,
     radiance: mi.Spectrum,
     nearness: mi.Float,
-    active: mi.Bool,
 ) -> Gathered:
     """What pixels may share of the ``radiance`` [W/m²/sr] that the wide lobes of a surface reflect.
 
-    ``nearness`` [1/m] is the inverse distance to where that comes from. Colours of light at several
-    wavelengths are in proportion to the albedo at these only if it's weighted by the light's hue.
+    ``u``, uniform in the unit square, is for the albedo, and ``nearness`` [1/m] is the inverse
+    distance to where that comes from. Colours of light at several wavelengths are in proportion to
+    the albedo at these only if it's weighted by the light's hue.
     """
-    albedo = bsdf.eval_diffuse_reflectance(si, active)
-    albedo += dr.select(single_lobe(bsdf), 0, GLOSS_ALBEDO)
+    si, albedo = vertex.si, vertex.lobes.albedo(u, vertex.smooth)
     if lookup.cache.hue is not None:
         albedo *= lookup.cache.hue_at(si.wavelengths)
-    shared = active & is_diffuse(bsdf) & (dr.max(albedo) > 0)
+    shared = vertex.smooth & is_diffuse(vertex.bsdf) & (dr.max(albedo) > 0)
     centre = opaque_point(scene.bbox().center())
     found = Gathered(radiance, albedo, si.sh_frame.n, si.p - centre, nearness, mi.Float(1))
     return found.where(shared)

@@ -93,14 +93,27 @@ class Lobes:
         all is wide, also where bumps turn the cosine. The cache holds the side that the path
         arrived on: transmission never qualifies.
         """
-        context = mi.BSDFContext()
-        context.type_mask = mi.BSDFFlags.DiffuseReflection
-        diffuse = self.bsdf.eval(context, self.si, wo, active & ~self.every)
+        diffuse = self.bsdf.eval(_diffuse_lobe(), self.si, wo, active & ~self.every)
         cosine = mi.Frame3f.cos_theta(wo)
         diffuse = dr.minimum(diffuse, self.most * dr.abs(cosine) * dr.inv_pi)
         all_of_it = self.every | (diffuse >= value)
         share = mi.Spectrum(dr.select(all_of_it, mi.Spectrum(1), diffuse / value))
         return dr.select(mi.Frame3f.cos_theta(self.si.wi) * cosine > 0, share, 0)
+
+    def albedo(self, u: mi.Point2f, active: mi.Bool | bool = True) -> mi.Spectrum:
+        """What the light that wide lobes reflect is in proportion to [1], on average over ``u``.
+
+        Beside others, a diffuse lobe isn't in proportion to its reflectance: light goes to and fro
+        below a varnish, and materials are blended. It's what it reflects from a direction ``u`` in
+        the unit square, by the cosine.
+        """
+        alone = single_lobe(self.bsdf)
+        wo = mi.warp.square_to_cosine_hemisphere(u)
+        cosine = dr.maximum(wo.z, 1e-3)  # Where it's 0, so is what is reflected.
+        wo.z = dr.mulsign(wo.z, self.si.wi.z)
+        beside = self.bsdf.eval(_diffuse_lobe(), self.si, wo, active & ~alone) * dr.pi / cosine
+        beside = dr.select(self.every, beside, dr.minimum(beside, self.most))
+        return dr.select(alone, self.bsdf.eval_diffuse_reflectance(self.si, active), beside)
 
     def scattered(self, lobe: mi.Float, bs: mi.BSDFSample3f, weight: mi.Spectrum) -> Scattered:
         """A direction that the material has sampled, by the random number ``lobe`` among others.
@@ -119,6 +132,12 @@ class Lobes:
         part = dr.select(wide, share / chance, (1 - share) / (1 - chance))
         weight = dr.select(dr.max(weight) > 0, weight * part, 0)
         return Scattered(bs, weight, specular, wide, lobe)
+
+
+def _diffuse_lobe() -> mi.BSDFContext:
+    context = mi.BSDFContext()
+    context.type_mask = mi.BSDFFlags.DiffuseReflection
+    return context
 
 
 @dr.syntax

@@ -15,6 +15,7 @@ from envmap_integrator.imaging import film as film_module
 from envmap_integrator.imaging.denoiser import denoise
 from tests.helpers import (
     SCENES,
+    Description,
     at,
     box,
     camera,
@@ -68,6 +69,50 @@ def test_less_error_with_textures_and_contacts(tiled, reference, kind):
     assert errors[0] < errors[1] / 3
     floors = [error_floor(some, reference) for some in (shared, apart)]
     assert floors[0] < floors[1] + 1e-4
+
+
+def chequered(low: float, high: float) -> Description:
+    tiles = {"type": "checkerboard", "to_uv": scaled(12)}
+    return tiles | {"color0": colour(low, low, low), "color1": colour(high, high, high)}
+
+
+#: Materials whose wide lobes aren't in proportion to what is called their diffuse reflectance.
+TEXTURED = {
+    "gloss": lambda: {
+        "type": "roughplastic",
+        "nonlinear": False,
+        "diffuse_reflectance": chequered(0.1, 1),
+    },
+    "varnish": lambda: {
+        "type": "plastic",
+        "nonlinear": True,
+        "diffuse_reflectance": chequered(0.1, 0.9),
+    },
+    "blend": lambda: {
+        "type": "blendbsdf",
+        "weight": chequered(0.1, 0.9),
+        "paint": grey(0.7)["bsdf"],
+        "metal": {"type": "roughconductor", "alpha": 0.3},
+    },
+    "mask": lambda: {"type": "mask", "opacity": chequered(0.2, 1), "paint": grey(0.6)["bsdf"]},
+    "metal": lambda: {
+        "type": "principled",
+        "metallic": chequered(0, 0.8),
+        "roughness": 0.4,
+        "base_color": colour(0.7, 0.7, 0.7),
+    },
+}
+
+
+@pytest.mark.parametrize("name", TEXTURED)
+def test_textures_of_any_material_stay_sharp(variant, name):
+    """Neither dark nor bright texels take their neighbours' light."""
+    scene = load(room(walls=box(2.0) | {"bsdf": TEXTURED[name]()}, sensor=camera(48, 36)))
+    apart = np.mean(pictures(scene, 256, irradiance_filter=False), axis=0).mean(axis=2)
+    shared = np.mean(pictures(scene, 32, irradiance_filter=True), axis=0).mean(axis=2)
+    dark, bright = np.quantile(apart, [0.3, 0.7])
+    for texels in (apart < dark, apart > bright):
+        assert shared[texels].sum() == pytest.approx(apart[texels].sum(), rel=0.025)
 
 
 def test_bias_falls_with_samples(tiled, reference):
