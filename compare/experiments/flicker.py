@@ -193,8 +193,8 @@ def _frames(
     name: str,
     same_seed: bool = False,
 ) -> tuple[Frames, int]:
-    """Frames, each with a seed of its own or all with one, and how many states they took."""
-    pictures, states = [], {}
+    """Frames, each with a seed of its own or all with one, and how many caches they took."""
+    pictures, caches = [], {}
     with stage(name, total=len(shots)) as advance:
         for index, shot in enumerate(shots):
             camera, integrator = shot(), make()
@@ -202,10 +202,10 @@ def _frames(
             picture = mi.render(scene, sensor=camera, integrator=integrator, spp=spp, seed=its_seed)
             pictures.append(np.array(picture)[:, :, :3])
             if hasattr(integrator, "prepare"):
-                state = integrator.prepare(scene, camera, spp)
-                states[id(state)] = state  # Held on to, so that no other gets its address.
+                cache = integrator.prepare(scene, camera, spp).cache
+                caches[id(cache)] = cache  # Held on to, so that no other gets its address.
             advance(1)
-    return np.stack(pictures), len(states)
+    return np.stack(pictures), len(caches)
 
 
 # ---------------------- Their flicker ----------------------
