@@ -6,7 +6,7 @@ import hashlib
 import math
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
 import drjit as dr
@@ -35,7 +35,7 @@ from ..lookup.lookup import Lookup
 from ..preparation.baked_state import BakedState, Settings, StateKey, load
 from ..preparation.pipeline import prepare
 from ..preparation.scene_state import SceneState, SceneStates
-from ..preparation.views import service, view_name
+from ..preparation.views import service, view_name, walks
 from ..system.checks import check_film, check_not_frozen, check_scene, check_variant
 from ..system.interrupt import interruptible
 from ..system.parameters import Parameters
@@ -194,12 +194,13 @@ class CachedIntegrator(mi.SamplingIntegrator):
         if not self.cache_file:
             settings = settings.for_render(camera_samples(view, spp))
         if (settings, name) not in self._prepared:
-            state = self._that_serves(scene, now, settings, view)
+            kept = {id(s.cache): s for (its, _), s in self._prepared.items() if its == settings}
+            state = _that_serves(kept.values(), scene, now, view)
             if state is None:
                 made = self._make(scene, now, key, settings, sensors)
                 for served in made.views:
                     self._keep(settings, served, made)
-                state = _serving(made, scene, now, view)
+                state = _that_serves([made], scene, now, view)
             if state is None:
                 raise ValueError(
                     f'{self.owner}: "cache_file" {self.cache_file} was made for other views than '
@@ -216,12 +217,6 @@ class CachedIntegrator(mi.SamplingIntegrator):
         caches = list({id(s.cache): s.cache for s in self._prepared.values()}.values())
         for old in caches[:-MOST_STATES]:
             self._prepared = {k: s for k, s in self._prepared.items() if s.cache is not old}
-
-    def _that_serves(self, scene, now, settings, view) -> BakedState | None:
-        """What has been prepared for other views, if it serves this one too."""
-        states = {id(s.cache): s for (its, _), s in self._prepared.items() if its == settings}
-        serving = (_serving(state, scene, now, view) for state in states.values())
-        return next((state for state in serving if state), None)
 
     def _make(self, scene, now, key, settings, sensors) -> BakedState:
         if self.cache_file:
@@ -528,15 +523,23 @@ class GatheringIntegrator(CachedIntegrator):
         return [*found.aovs, *(c for x in indirect for c in rgb(seen(x, wavelengths)))]
 
 
-def _serving(
-    state: BakedState, scene: mi.Scene, now: SceneState, view: mi.Sensor | None
+def _that_serves(
+    states: Iterable[BakedState], scene: mi.Scene, now: SceneState, view: mi.Sensor | None
 ) -> BakedState | None:
-    """The state for a view, with the error of its picture; None if it doesn't serve that."""
-    if view is None or view_name(view) in state.views:
-        return state
+    """The first of some states that serves a view, with the error of its picture."""
+    states = list(states)
+    for state in states:
+        if view is None or view_name(view) in state.views:
+            return state
+    if not states:
+        return None
     with dr.suspend_grad():
-        found = service(scene, now.ids, state.cache, state.size_error, view)
-    return replace(state, relative_error=found.error) if found.suffices(state.service) else None
+        points = walks(scene, now.ids, view)
+        for state in states:
+            found = service(points, state.cache, state.size_error)
+            if found.suffices(state.service):
+                return replace(state, relative_error=found.error)
+    return None
 
 
 def camera_samples(sensor: mi.Sensor | None, spp: int) -> int:

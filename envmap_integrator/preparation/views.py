@@ -11,7 +11,7 @@ import numpy as np
 from ..lookup.ids import ObjectIds
 from ..lookup.irradiance_cache import IrradianceCache
 from .coarse_mesh.mesh import CoarseMesh
-from .coarse_mesh.surface_points import WALK_HITS, walk_from
+from .coarse_mesh.surface_points import WALK_HITS, SurfacePoints, walk_from
 from .radiosity.noise import TARGET
 from .radiosity.view_error import view_error
 
@@ -70,18 +70,16 @@ def usual_service(mesh: CoarseMesh, error: float) -> Service:
     return Service(min(found), min(patches), error)
 
 
-def service(
-    scene: mi.Scene,
-    object_ids: ObjectIds,
-    cache: IrradianceCache,
-    size_error: float,
-    sensor: mi.Sensor,
-) -> Service:
-    """What a state does for another sensor; ``size_error`` [1] is that by the size of its patches.
+def walks(scene: mi.Scene, object_ids: ObjectIds, sensor: mi.Sensor) -> SurfacePoints:
+    """What secondary rays of a sensor meet; any number of states are asked how they serve it."""
+    return walk_from(scene, object_ids, sensor, RAYS, HITS)
+
+
+def service(points: SurfacePoints, cache: IrradianceCache, size_error: float) -> Service:
+    """What a state does for the sensor of ``walks``; ``size_error`` [1] is that by patches' size.
 
     What their size does to the view isn't known: it counts as for those it was made for.
     """
-    points = walk_from(scene, object_ids, sensor, RAYS, HITS)
     if len(points) == 0:
         return Service(1.0, np.inf, 0.0)  # Nothing is asked for.
     place = points.places()
@@ -89,7 +87,7 @@ def service(
     patch = cache.patches.find(*place, cell)
     index = np.where(patch.found.numpy(), patch.index.numpy().astype(np.int64), -1)
     later = (points.bounce > 0) & (points.bounce < WALK_HITS)
-    error = view_error(points, cell, patch, cache)
+    error = view_error(points, cell, index, patch.even.numpy(), cache)
     return Service(*_service(index[later]), float(np.hypot(error, size_error)))
 
 

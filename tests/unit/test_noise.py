@@ -11,14 +11,13 @@ import pytest
 
 from envmap_integrator.lookup.irradiance_cache import IrradianceCache
 from envmap_integrator.preparation.coarse_mesh.patch_points import PatchPoints
-from envmap_integrator.preparation.coarse_mesh.surface_points import walk_from
 from envmap_integrator.preparation.radiosity.coarseness import Coarseness
 from envmap_integrator.preparation.radiosity.gather import block_mean, gather
 from envmap_integrator.preparation.radiosity.incidence import Incidence
 from envmap_integrator.preparation.radiosity.irradiance import solve_irradiance
 from envmap_integrator.preparation.radiosity.noise import TARGET, Noise
 from envmap_integrator.preparation.radiosity.unknowns import Unknowns
-from envmap_integrator.preparation.radiosity.view_error import view_error
+from envmap_integrator.preparation.views import service, walks
 from tests.helpers import Description, at, box, camera, emitting, grey, load, room
 from tests.unit.kit import CoarseMesh, coarse_mesh
 
@@ -66,7 +65,7 @@ def solutions(
     if view is None:
         points, patch = coarse.points, coarse.patch_of_point
     else:
-        points = walk_from(scene, coarse.object_ids, view, 4096, 16)
+        points = walks(scene, coarse.object_ids, view)
         index, _, found = coarse.find(points)
         patch = np.where(found, index.astype(int), -1)
     seen = (points.seen > 0) & (points.bounce == 0) & (patch >= 0)
@@ -93,11 +92,8 @@ def solutions(
 
 
 def error_of(view: mi.Sensor, coarse: CoarseMesh, cache: IrradianceCache) -> float:
-    """What ``view_error`` states for a view."""
-    points = walk_from(coarse.scene, coarse.object_ids, view, 4096, 16)
-    place = points.places()
-    cell = cache.patches.locate(*place)
-    return view_error(points, cell, cache.patches.find(*place, cell), cache)
+    """What a view that the cache wasn't made for is told."""
+    return service(walks(coarse.scene, coarse.object_ids, view), cache, 0.0).error
 
 
 @pytest.mark.parametrize("scene", [lambda: load(room()), behind_a_wall], ids=["room", "gap"])

@@ -14,6 +14,7 @@ from envmap_integrator.preparation.views import (
     service,
     usual_service,
     view_name,
+    walks,
 )
 from tests.helpers import box, camera, emitting, grey, load, room
 from tests.unit.kit import CoarseMesh, coarse_mesh, scene_of
@@ -22,7 +23,8 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 
 def served(coarse: CoarseMesh, sensor: mi.Sensor) -> Service:
-    return service(coarse.scene, coarse.object_ids, coarse.solve(16), 0.0, sensor)
+    points = walks(coarse.scene, coarse.object_ids, sensor)
+    return service(points, coarse.solve(16), 0.0)
 
 
 def test_a_view_is_named_by_where_it_looks():

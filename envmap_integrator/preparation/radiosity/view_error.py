@@ -10,27 +10,27 @@ from __future__ import annotations
 import numpy as np
 
 from ...lookup.irradiance_cache import IrradianceCache
-from ...lookup.patches import Cell, FoundPatch
+from ...lookup.patches import Cell
 from ...system.spectrum import n_packets
 from ..coarse_mesh.surface_points import SurfacePoints
 
 
 def view_error(
-    points: SurfacePoints, cell: Cell, patch: FoundPatch, cache: IrradianceCache
+    points: SurfacePoints, cell: Cell, patch: np.ndarray, even: np.ndarray, cache: IrradianceCache
 ) -> float:
     """Standard error of the brightness of a view's picture, over that brightness [1].
 
-    ``points`` are those of ``walk_from`` the sensor, ``cell`` and ``patch`` what is found there in
-    the coarse mesh of the ``cache``. Infinite for a view of patches that are all dark.
+    ``points`` are those of ``walk_from`` the sensor, ``cell`` and ``patch`` [N] what is found there
+    in the coarse mesh of the ``cache``, -1 where nothing is, and ``even`` [N] whether light is even
+    there. Infinite for a view of patches that are all dark.
     """
     # ---- Points sorted by walk, and by bounce; the first ones gather by rays of their own ----
     order = np.argsort(points.start, kind="stable")
     walk, position, reflects, diffuse = (
         x[order] for x in (points.start, points.position, points.reflects, points.diffuse)
     )
-    index, found, even, size = (
-        x.numpy()[order] for x in (patch.index, patch.found, patch.even, cell.patch_size)
-    )
+    index, even, size = (x[order] for x in (patch, even, cell.patch_size.numpy()))
+    found = index >= 0
     first = np.append(True, walk[1:] != walk[:-1])
     seen = found & first
     total = cache.mean_channel().reshape(-1, n_packets(), 2).mean(axis=1)[:, 0]
