@@ -204,7 +204,7 @@ def _apart(film, found, weight, wavelengths):
     apart = found.radiance - found.gathered.radiance
     aovs = (weight * value for value in found.aovs)
     shown = _shown(film, apart, found.valid, weight, wavelengths)
-    return [*shown, *aovs, *found.gathered.as_colours(wavelengths).channels()]
+    return [*shown, *aovs, *found.gathered.to_add(wavelengths).channels()]
 
 
 def _directly(key, function, *inputs):

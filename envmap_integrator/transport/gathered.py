@@ -20,7 +20,8 @@ class Gathered:
     normal     [3]        shading normal
     position   [3]        relative to a point near the scene, world units
     nearness   [1/m]      inverse distance of what the secondary ray hit
-    weight     [1]        1 if there is such a surface, else all are zero
+    weight     [1]        1 if there is such a surface, else all are zero; in sums, what the
+                          three above are weighted by
     """
 
     radiance: mi.Spectrum | mi.Color3f
@@ -49,10 +50,17 @@ class Gathered:
         values = (dr.select(mask, getattr(self, name), 0) for name in self.CHANNELS)
         return Gathered(*values)
 
-    def as_colours(self, wavelengths: mi.Color0f | mi.Spectrum) -> Gathered:
-        """The same with what adds up over samples of any wavelengths [nm]."""
+    def to_add(self, wavelengths: mi.Color0f | mi.Spectrum) -> Gathered:
+        """The same with what adds up over samples of any wavelengths [nm], and of any surfaces.
+
+        Each counts by what it reflects, as its irradiance does. So a pixel that sees one through a
+        pane and another mirrored in it is somewhere between them, and as far from a pixel where the
+        first is darker as their irradiance is unlike.
+        """
         radiance, albedo = (colour(x, wavelengths) for x in (self.radiance, self.albedo))
-        return replace(self, radiance=radiance, albedo=albedo)
+        weight = self.weight * dr.abs(dr.mean(self.albedo))
+        guides = (weight * x for x in (self.normal, self.position, self.nearness))
+        return Gathered(radiance, albedo, *guides, weight)
 
     @classmethod
     def count(cls) -> int:

@@ -20,6 +20,7 @@ from tests.helpers import (
     box,
     camera,
     colour,
+    emitting,
     film,
     grey,
     integrator,
@@ -108,6 +109,22 @@ TEXTURED = {
 def test_textures_of_any_material_stay_sharp(variant, name):
     """Neither dark nor bright texels take their neighbours' light."""
     scene = load(room(walls=box(2.0) | {"bsdf": TEXTURED[name]()}, sensor=camera(48, 36)))
+    assert_texels_stay(scene)
+
+
+def test_textures_behind_a_pane_stay_sharp(variant):
+    """What is mirrored in it, over dark texels most of what is seen, has other light."""
+    tiles = {"type": "diffuse", "reflectance": chequered(0.02, 0.8)}
+    floor = {"type": "rectangle", "to_world": at(0, 0, -1.9).scale(1.9), "bsdf": tiles}
+    tilted = at(0, -1.2, -0.4).rotate([1, 0, 0], 60).scale(1.5)
+    pane = {"type": "rectangle", "to_world": tilted, "bsdf": {"type": "thindielectric"}}
+    up = {"type": "rectangle", "to_world": at(0, 0, 1) @ scaled(0.5)} | grey(0) | emitting(10)
+    sensor = camera(64, 48, target=(0, -0.5, -1.9), fov=50)
+    parts = {"floor": floor, "pane": pane, "lamp": up, "sensor": sensor}
+    assert_texels_stay(load(room(walls=box(2.0) | grey(0.9), block=None, ball=None, **parts)))
+
+
+def assert_texels_stay(scene):
     apart = np.mean(pictures(scene, 256, irradiance_filter=False), axis=0).mean(axis=2)
     shared = np.mean(pictures(scene, 32, irradiance_filter=True), axis=0).mean(axis=2)
     dark, bright = np.quantile(apart, [0.3, 0.7])
