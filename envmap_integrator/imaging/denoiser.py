@@ -10,6 +10,10 @@ from .film import INDIRECT_AOVS
 GUIDE_SPP = 16
 """At most so many samples per pixel for albedo and normals, which have little noise."""
 
+DARK = 1 / 32
+"""What reflects less than this part of the mean keeps its light: its irradiance, a little light
+over next to nothing, as of a metal that is hardly diffuse, would shine over all around."""
+
 
 def prepare_for_denoiser(integrator: mi.Integrator) -> bool:
     """Have an integrator give the AOVs that help ``denoise``.
@@ -49,11 +53,12 @@ def denoise(
     if integrator.aov_names()[-n_aovs:] != list(INDIRECT_AOVS):
         return _filter(colour, albedo, normal)
     indirect, gathered, reflectance = np.split(picture[:, :, -n_aovs:], 3, axis=2)
-    lit = reflectance > 0
-    irradiance = np.where(lit, gathered / np.where(lit, reflectance, 1), 0)
+    lit = reflectance > DARK * reflectance.mean()
+    usual = gathered.sum(axis=(0, 1)) / np.maximum(reflectance.sum(axis=(0, 1)), 1e-30)
+    irradiance = np.where(lit, gathered / np.where(lit, reflectance, 1), usual)
     irradiance = _filter(irradiance, np.ones_like(albedo), normal)
-    gathered = np.where(lit, reflectance * irradiance, gathered)
-    return _filter(colour - indirect, albedo, normal) + gathered
+    rest = colour - indirect + np.where(lit, 0, gathered)
+    return _filter(rest, albedo, normal) + np.where(lit, reflectance * irradiance, 0)
 
 
 def warm_up(width: int, height: int) -> None:

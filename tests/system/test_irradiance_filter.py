@@ -17,6 +17,7 @@ from tests.helpers import (
     SCENES,
     Description,
     at,
+    block,
     box,
     camera,
     colour,
@@ -313,3 +314,19 @@ def test_the_denoiser_takes_direct_light_apart(tiled, reference, kind):
     errors = [np.mean([rel_mse(p, reference) for p in some]) for some in (whole, apart)]
     assert errors[1] < 0.9 * errors[0]
     assert np.mean(apart) == pytest.approx(np.mean(reference), rel=0.01)
+
+
+def test_metal_does_not_shine_over_its_edges(variant):
+    """It has next to no diffuse reflectance, and irradiance is over that."""
+    gold = {
+        "type": "principled",
+        "base_color": colour(0.9, 0.6, 0.2),
+        "metallic": 1.0,
+        "roughness": 0.04,
+    }
+    scene = load(room(block=block(-0.5, 0.2, -1.4, 0.6) | {"bsdf": gold}, sensor=camera(96, 72)))
+    reference = np.mean(pictures(scene, 256), axis=0)
+    ours = mi.load_dict({"type": "envmap_hybrid", "indirect_aovs": True})
+    channels = np.array(mi.render(scene, integrator=ours, spp=16))
+    noisy, clean = channels[:, :, :3], denoise(scene, ours, channels, 16, 0)
+    assert np.square(clean - reference).mean() < 0.7 * np.square(noisy - reference).mean()
