@@ -131,6 +131,7 @@ def _improve(args, scene, sensor, settings, seconds, more, stack, output) -> mi.
         progress_file=output.with_suffix(".progress.exr") if keeps else None,
         resume=args.resume,
         elsewhere=elsewhere,
+        planned=settings["spp"] if args.time else 0,  # How many there is time for, nobody knows.
     )
     for better in pictures:
         elapsed = time.perf_counter() - begin

@@ -305,13 +305,14 @@ class CachedIntegrator(mi.SamplingIntegrator):
         progress_file: str | os.PathLike | None = None,
         resume: bool = False,
         elsewhere: Callable[[BakedState, int], Renderer] | None = None,
+        planned: int = 0,
     ) -> Iterator[Improving]:
         """Render a sensor in passes of ``spp`` samples per pixel.
 
         It ends after ``total`` samples, after so many ``seconds``, pre-passes included, or when the
         noise that is left has a relMSE of ``target_error``. After 1, 2, 3, 4, 6, 8, 12 … passes,
         and the last, comes a picture of all so far; the film has it too. The pre-passes are those
-        for ``total`` samples.
+        for ``planned`` samples per pixel, or for ``total`` if that is 0.
 
         ``progress_file`` keeps what has been rendered, from every picture and from Ctrl-C on. With
         ``resume`` it goes on from there, to the same bits as if it hadn't ended. If ``total`` is
@@ -329,7 +330,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
             sensor = scene.sensors()[sensor]
         size = sensor.film().crop_size()
         stored = stored_progress(progress_file) if resume else None
-        planned = planned_samples(stored) if stored else total
+        planned = planned_samples(stored) if stored else planned or total
         now, baked = self._ready(scene, sensor, planned)
         lookup, recorder = self._lookup(scene, now, baked, planned)
         made_for = self._made_with(sensor, baked, seed, spp)

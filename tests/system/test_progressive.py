@@ -66,6 +66,33 @@ def test_passes_add_up(scene, kind):
     assert array(found[-1]).mean() == pytest.approx(at_once.mean(), rel=0.003)
 
 
+def test_pre_passes_may_be_for_fewer_samples(scene):
+    """Nobody knows how many there is time for, and a first picture mustn't wait for the most."""
+    plugin = mi.load_dict({"type": "envmap_hybrid"})
+    few = last(plugin.progressive(scene, spp=8, total=8))
+    many = plugin.progressive(scene, spp=8, total=1 << 14, planned=8)
+    assert next(many).state.cache is few.state.cache
+    many.close()
+
+
+def test_with_a_time_they_are_for_the_samples_of_the_scene(tmp_path, monkeypatch):
+    asked = {}
+
+    def progressive(self, *args, **settings):
+        asked.update(settings)
+        return given(self, *args, **settings)
+
+    plugin = type(ours())
+    given = plugin.progressive
+    monkeypatch.setattr(plugin, "progressive", progressive)
+    room_file = str(SCENES / "paper_room.xml")
+    command = ["render", room_file, "--integrator", "envmap_hybrid", "-o", str(tmp_path / "a.exr")]
+    small = ["-D", "resx=32", "-D", "resy=24", "-D", "spp=8", "--quiet"]
+    for end, planned in (("--time=1", 8), ("--target-error=0.1", 0)):
+        assert main([*command, *small, end]) == 0
+        assert asked["planned"] == planned
+
+
 def test_as_little_noise_as_at_once(scene):
     """Passes share the strata of one picture."""
     plugin = ours()
