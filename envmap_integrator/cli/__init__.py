@@ -135,7 +135,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_sensor(render)
     render.add_argument("-o", "--output", type=Path, help="default: beside the scene, .exr")
     render.add_argument(
-        "--spp", type=int, default=0, help="samples per pixel, default: the scene's"
+        "--spp", type=int, default=0, help="samples per pixel; 0, the default: the scene's"
     )
     render.add_argument("--seed", type=int, default=0, help="of the sampler")
     render.add_argument("--png", action="store_true", help="also write an sRGB PNG beside the EXR")
@@ -194,7 +194,7 @@ def build_parser() -> argparse.ArgumentParser:
     inspect.add_argument("-o", "--output", type=Path, help="default: beside the scene, .html")
     inspect.add_argument(
         "--spp", type=int, default=0,
-        help="samples per pixel of the render that it is about, default: the scene's",
+        help="samples per pixel of the render that it is about; 0, the default: the scene's",
     )  # fmt: skip
     inspect.add_argument("--seed", type=int, default=0, help="of the sampler")
     inspect.set_defaults(command=commands.inspect, denoise=False)

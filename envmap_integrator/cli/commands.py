@@ -24,6 +24,7 @@ from envmap_integrator.imaging.film import has_bands
 from envmap_integrator.imaging.progressive import Improving
 from envmap_integrator.inspection import page
 from envmap_integrator.system.atomic import check_writable
+from envmap_integrator.system.checks import check_size
 from envmap_integrator.system.llvm import ensure_llvm
 from envmap_integrator.system.scene_file import DEFAULT_INTEGRATOR, SceneFile
 
@@ -39,7 +40,7 @@ def render(args: argparse.Namespace) -> int:
     with record_kernels():
         # Merged meshes have another order in each process.
         scene_file, scene = _load(args, seconds, merge_meshes=not _by_workers(args))
-        sensor = _sensor(scene, args.sensor)
+        sensor = _sensor(args, scene)
         _require(
             not (has_bands(sensor.film()) and (args.denoise or args.png)),
             "--denoise and --png need colour, the film holds bands: leave them out, or take a "
@@ -247,7 +248,7 @@ def inspect(args: argparse.Namespace) -> int:
             )
             scene_file.configure_integrator(name, dict(args.set) | {"sampler": "coherent"})
             scene = scene_file.load(merge_meshes=False)  # Shapes keep their names.
-        sensor = _sensor(scene, args.sensor)
+        sensor = _sensor(args, scene)
         settings = _settings(args, scene_file, scene, sensor)
         with measure(seconds, "survey and page"):
             page.inspect(
@@ -285,13 +286,15 @@ def _load(
         return scene_file, scene_file.load(merge_meshes)
 
 
-def _sensor(scene: mi.Scene, index: int) -> mi.Sensor:
-    sensors = scene.sensors()
+def _sensor(args: argparse.Namespace, scene: mi.Scene) -> mi.Sensor:
+    """The one that is asked for; Mitsuba's integrators don't say that its picture is empty."""
+    index, sensors = args.sensor, scene.sensors()
     _require(
         0 <= index < len(sensors),
         f"-s/--sensor {index} is out of range: the scene has {len(sensors)} sensor(s), the first "
         "is 0",
     )
+    check_size(sensors[index], args.spp)
     return sensors[index]
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from ..imaging.aovs import false_colour
 from ..preparation.maps.clusters import LOOK_UP_COST
 from ..system.atomic import check_writable, replacing
+from ..system.checks import check_size
 from . import advice
 from .pictures import eight_bits, embedded, on_ramp, ramp_css, shrunk, tone_mapped, white_of
 from .survey import ClusterView, Survey, View, survey
@@ -87,6 +88,7 @@ def inspect(
     template = _load_template()  # What may be missing is found before the work starts.
     check_writable(Path(path))
     sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+    check_size(sensor, spp)
     spp = spp or sensor.sampler().sample_count()
     settings = settings or {"spp": spp, "seed": seed, "integrator": integrator}
     found = survey(scene, sensor, integrator, spp, seed)

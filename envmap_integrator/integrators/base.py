@@ -36,7 +36,7 @@ from ..preparation.baked_state import BakedState, Settings, StateKey, load
 from ..preparation.pipeline import prepare
 from ..preparation.scene_state import SceneState, SceneStates
 from ..preparation.views import service, view_name, walks
-from ..system.checks import check_film, check_not_frozen, check_scene, check_variant
+from ..system.checks import check_film, check_not_frozen, check_scene, check_size, check_variant
 from ..system.interrupt import interruptible
 from ..system.parameters import Parameters
 from ..system.recording import Recorder
@@ -187,6 +187,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
         else:
             view = sensors[sensor or 0] if sensors else None
         if view:
+            check_size(view, spp)
             self.check_sensor(view)
         name = view_name(view) if view else ""
         if view and name not in map(view_name, sensors):

@@ -77,6 +77,22 @@ def check_scene(scene: mi.Scene, owner: str) -> None:
             )
 
 
+def check_size(sensor: mi.Sensor, spp: int) -> None:
+    """Raise ``ValueError`` for pictures without pixels or samples; 0 ``spp`` are the sampler's."""
+    width, height = (int(n) for n in sensor.film().crop_size())
+    if not width * height:
+        raise ValueError(
+            f'the film of sensor "{sensor.id()}" has no pixels, but {width} x {height}; set its '
+            '"width" and "height" to 1 or more'
+        )
+    samples = spp or sensor.sampler().sample_count()
+    if samples < 1:
+        raise ValueError(
+            f'the sampler of sensor "{sensor.id()}" is to take {samples} samples per pixel; set '
+            'its "sample_count" to 1 or more, or ask for so many'
+        )
+
+
 def check_film(sensor: mi.Sensor, owner: str) -> None:
     """Raise ``ValueError`` for films with bands beyond the wavelengths that are stored."""
     response = sensor.film().sensor_response_function()

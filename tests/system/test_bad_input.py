@@ -242,3 +242,38 @@ def test_shell(tmp_path, capfd, inside, scene, message, command):
     assert re.fullmatch(r"envmap-render: [^\n]+\n", error)
     assert "Traceback" not in error and len(error) < 400
     assert not output.exists()
+
+
+EMPTY = {
+    "pixels": ('name="height" value="4"', 'name="height" value="0"', 'the film of sensor "'),
+    "samples": (
+        '<film type="hdrfilm">',
+        '<sampler type="independent"> <integer name="sample_count" value="0"/> </sampler>'
+        '<film type="hdrfilm">',
+        'the sampler of sensor "',
+    ),
+}
+
+
+@pytest.mark.parametrize("case", EMPTY)
+@pytest.mark.parametrize(
+    ("command", "options"),
+    [("render", []), ("render", ["--integrator", "path"]), ("bake", []), ("inspect", [])],
+    ids=["render", "path", "bake", "inspect"],
+)
+def test_pictures_of_nothing(tmp_path, capfd, case, command, options):
+    old, new, message = EMPTY[case]
+    path = tmp_path / "scene.xml"
+    output = tmp_path / f"output.{'html' if command == 'inspect' else 'exr'}"
+    path.write_text(XML.replace(old, new).format(integrator="", scene=BALL.format("") + SKY))
+    assert main([command, str(path), "-o", str(output), *options]) == 2
+    error = capfd.readouterr().err
+    assert re.fullmatch(r"envmap-render: [^\n]+; set its [^\n]+\n", error) and message in error
+    assert not output.exists()
+
+
+def test_samples_that_are_asked_for_need_no_count():
+    sensor = camera(4, 4, sampler={"type": "independent", "sample_count": 0})
+    ours, scene = integrator("envmap_hybrid", patches=64), load(room(sensor=sensor))
+    ours.render(scene, spp=1)
+    assert 'is to take 0 samples per pixel; set its "sample_count"' in complaint(ours.render, scene)

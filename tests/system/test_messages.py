@@ -188,6 +188,12 @@ def nested_without_sensor(s: Surroundings) -> None:
     mi.render(load(room(sensor=None)), sensor=sensor, integrator=within, spp=1)
 
 
+def rendered(*size: int, **more: object) -> Callable:
+    """A picture by such a ``camera``."""
+    ours = "one_level_path"
+    return lambda _: integrator(ours).render(load(room(sensor=camera(*size, **more))))
+
+
 def altered(change: Callable[[dict, dict], object]) -> Callable[[Surroundings], Path]:
     """A state of which ``change(parts, metadata)`` has altered something."""
 
@@ -564,6 +570,13 @@ CASES = {
     "gradients": Case(differentiated, "envmap_hybrid", "can't be differentiated", "use prb for"),
     "no sensor": Case(
         nested_without_sensor, "envmap_hybrid", "there are none", "add the sensor to the scene"
+    ),
+    "no pixels": Case(
+        rendered(0, 24), 'the film of sensor "sensor"', "0 x 24", '"height" to 1 or more'
+    ),
+    "no samples": Case(
+        rendered(sampler={"type": "independent", "sample_count": 0}),
+        'the sampler of sensor "sensor"', "0 samples per pixel", '"sample_count" to 1 or more',
     ),
     # ---- The machine ----
     "variant": Case(other_variant, "envmap_hybrid", "variant scalar_rgb", "use one of llvm_ad_rgb"),
