@@ -24,7 +24,7 @@ from envmap_integrator.imaging.film import has_bands
 from envmap_integrator.imaging.progressive import Improving
 from envmap_integrator.inspection import page
 from envmap_integrator.system.atomic import check_writable
-from envmap_integrator.system.checks import check_size
+from envmap_integrator.system.checks import check_size, sensor_of
 from envmap_integrator.system.llvm import ensure_llvm
 from envmap_integrator.system.scene_file import DEFAULT_INTEGRATOR, SceneFile
 
@@ -111,8 +111,6 @@ def _improve(args, scene, sensor, settings, seconds, more, stack, output) -> mi.
         not args.denoise,
         "--denoise takes one picture: leave out --progressive, --time and --target-error",
     )
-    for flag, value in (("--time", args.time), ("--target-error", args.target_error)):
-        _require(value is None or value > 0, f"{flag} must be above 0, got {value}")
     elsewhere = None
     if _by_workers(args):
         with measure(seconds, "find workers"):
@@ -127,7 +125,7 @@ def _improve(args, scene, sensor, settings, seconds, more, stack, output) -> mi.
         args.seed,
         PASS,
         total,
-        seconds=args.time or math.inf,
+        seconds=math.inf if args.time is None else args.time,
         target_error=args.target_error or 0.0,
         progress_file=output.with_suffix(".progress.exr") if keeps else None,
         resume=args.resume,
@@ -288,14 +286,9 @@ def _load(
 
 def _sensor(args: argparse.Namespace, scene: mi.Scene) -> mi.Sensor:
     """The one that is asked for; Mitsuba's integrators don't say that its picture is empty."""
-    index, sensors = args.sensor, scene.sensors()
-    _require(
-        0 <= index < len(sensors),
-        f"-s/--sensor {index} is out of range: the scene has {len(sensors)} sensor(s), the first "
-        "is 0",
-    )
-    check_size(sensors[index], args.spp)
-    return sensors[index]
+    sensor = sensor_of(scene, args.sensor)
+    check_size(sensor, args.spp)
+    return sensor
 
 
 def _settings(

@@ -16,6 +16,7 @@ import numpy as np
 import envmap_integrator
 
 from ..imaging.denoiser import prepare_for_denoiser
+from ..system.checks import sensor_of
 from ..system.llvm import LLVMError, ensure_llvm
 from ..system.scene_file import SceneFile
 
@@ -132,12 +133,7 @@ class View:
     @contextmanager
     def of(self, scene: mi.Scene) -> Iterator[mi.Sensor]:
         """That sensor, for the block at that place; ``ValueError`` if the scene has none such."""
-        sensors = scene.sensors()
-        if not 0 <= self.sensor < len(sensors):
-            raise ValueError(
-                f"there is no sensor {self.sensor}: the scene has {len(sensors)}; count from 0"
-            )
-        sensor = sensors[self.sensor]
+        sensor = sensor_of(scene, self.sensor)
         if self.to_world is None:
             yield sensor
             return

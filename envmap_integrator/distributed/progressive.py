@@ -16,6 +16,7 @@ from distributed import Client
 from ..imaging.film import Sums, n_pixels_of, pixel_ranges
 from ..imaging.progressive import Improving, Pass, Renderer
 from ..preparation.baked_state import BakedState
+from ..system.checks import sensor_of
 from . import worker
 from .job import Job, View
 from .render import (
@@ -81,7 +82,7 @@ def by_workers(
     """
     check_parts(scene.integrator())
     check_workers(client, job)
-    n_pixels = n_pixels_of(scene.sensors()[sensor].film())
+    n_pixels = n_pixels_of(sensor_of(scene, sensor).film())
 
     def elsewhere(baked: BakedState, planned: int) -> Renderer:
         state = send_state(client, baked)

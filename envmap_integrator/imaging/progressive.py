@@ -67,6 +67,20 @@ class Pass(NamedTuple):
 Renderer = Callable[[Iterator[Pass]], Generator[Sums]]
 
 
+def check_ends(owner: str, spp: int, total: int, seconds: float, target_error: float) -> None:
+    """Raise ``ValueError`` for passes without samples, and for ends that are there at once."""
+    for name, value in (("spp", spp), ("total", total)):
+        if value < 1:
+            raise ValueError(f'{owner}: "{name}" must be at least 1, not {value}')
+    if not seconds > 0:
+        raise ValueError(f'{owner}: "seconds" or --time must be above 0, not {seconds}')
+    if not target_error >= 0:
+        raise ValueError(
+            f'{owner}: "target_error" or --target-error must be above 0 or left out, not '
+            f"{target_error}"
+        )
+
+
 def improve(
     render: Renderer,
     develop: Callable[[Sums, int], mi.TensorXf],

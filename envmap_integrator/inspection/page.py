@@ -13,7 +13,8 @@ import numpy as np
 from ..imaging.aovs import false_colour
 from ..preparation.maps.clusters import LOOK_UP_COST
 from ..system.atomic import check_writable, replacing
-from ..system.checks import check_size
+from ..system.checks import check_size, sensor_of
+from ..system.scene_file import DEFAULT_INTEGRATOR
 from . import advice
 from .pictures import eight_bits, embedded, on_ramp, ramp_css, shrunk, tone_mapped, white_of
 from .survey import ClusterView, Survey, View, survey
@@ -73,13 +74,14 @@ def inspect(
     """Write an HTML page that tells why pictures of a scene are as they are.
 
     It's about a render of ``spp`` samples per pixel (0: the sensor's) by an ``envmap_hybrid`` or
-    ``one_level_path``, the scene's own if none is passed. ``settings`` are shown on it. Shapes go
-    by their ids: where ``mi.load_file`` has merged meshes they have none, see ``optimize``.
+    ``one_level_path``: if none is passed the scene's own, or ``envmap_hybrid`` if that has none.
+    ``settings`` are shown on it. Shapes go by their ids: where ``mi.load_file`` has merged meshes
+    they have none, see ``optimize``.
 
     Raises ``ValueError`` for other integrators and as ``integrator.prepare`` does, ``ImportError``
     if the optional package jinja2 is missing, and ``StorageError`` if there can be no such file.
     """
-    integrator = integrator or scene.integrator()
+    integrator = integrator or scene.integrator() or mi.load_dict({"type": DEFAULT_INTEGRATOR})
     if not hasattr(integrator, "aovs"):
         raise ValueError(
             f'integrator "{integrator.class_name()}" has nothing to inspect: pass '
@@ -87,7 +89,7 @@ def inspect(
         )
     template = _load_template()  # What may be missing is found before the work starts.
     check_writable(Path(path))
-    sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+    sensor = sensor_of(scene, sensor)
     check_size(sensor, spp)
     spp = spp or sensor.sampler().sample_count()
     settings = settings or {"spp": spp, "seed": seed, "integrator": integrator}

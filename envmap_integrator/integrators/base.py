@@ -28,7 +28,7 @@ from ..imaging.film import (
     put_plain,
 )
 from ..imaging.progress_file import Progress, planned_samples, progress_of, stored_progress
-from ..imaging.progressive import Improving, Renderer, improve
+from ..imaging.progressive import Improving, Renderer, check_ends, improve
 from ..lookup.far_field import FarField
 from ..lookup.irradiance_cache import IrradianceCache
 from ..lookup.lookup import Lookup
@@ -36,7 +36,14 @@ from ..preparation.baked_state import BakedState, Settings, StateKey, load
 from ..preparation.pipeline import prepare
 from ..preparation.scene_state import SceneState, SceneStates
 from ..preparation.views import service, view_name, walks
-from ..system.checks import check_film, check_not_frozen, check_scene, check_size, check_variant
+from ..system.checks import (
+    check_film,
+    check_not_frozen,
+    check_scene,
+    check_size,
+    check_variant,
+    sensor_of,
+)
 from ..system.interrupt import interruptible
 from ..system.parameters import Parameters
 from ..system.recording import Recorder
@@ -182,10 +189,10 @@ class CachedIntegrator(mi.SamplingIntegrator):
             check_scene(scene, self.owner)
             self._made_for, self._prepared = (key, self.cache_file), {}
         sensors = list(scene.sensors())
-        if isinstance(sensor, mi.Sensor):
-            view = sensor
+        if sensor is None:
+            view = sensors[0] if sensors else None
         else:
-            view = sensors[sensor or 0] if sensors else None
+            view = sensor_of(scene, sensor)
         if view:
             check_size(view, spp)
             self.check_sensor(view)
@@ -250,8 +257,7 @@ class CachedIntegrator(mi.SamplingIntegrator):
 
         Raises ``ValueError`` as ``prepare`` does, and for more samples than ``sampler`` takes.
         """
-        if isinstance(sensor, int):
-            sensor = scene.sensors()[sensor]
+        sensor = sensor_of(scene, sensor)
         now, baked = self._ready(scene, sensor, spp)
         film = sensor.film()
         with interruptible(), dr.suspend_grad():
@@ -322,13 +328,14 @@ class CachedIntegrator(mi.SamplingIntegrator):
         ``elsewhere(state, planned)`` gives what renders passes in place of this process, from a
         baked state, of a picture that is to have so many samples: see ``distributed``.
 
-        Raises ``ValueError`` as ``prepare`` does, if ``sampler`` isn't ``coherent``, and for a
-        ``progress_file`` that is missing, damaged, or of another scene, sensor or setting.
+        Raises ``ValueError`` as ``prepare`` does, for numbers that ask for no picture, if
+        ``sampler`` isn't ``coherent``, and for a ``progress_file`` that is missing, damaged, or of
+        another scene, sensor or setting.
         """
         deadline = time.perf_counter() + seconds
         self.require_coherent("has no end of samples")
-        if isinstance(sensor, int):
-            sensor = scene.sensors()[sensor]
+        check_ends(self.owner, spp, total, seconds, target_error)
+        sensor = sensor_of(scene, sensor)
         size = sensor.film().crop_size()
         stored = stored_progress(progress_file) if resume else None
         planned = planned_samples(stored) if stored else planned or total

@@ -77,6 +77,20 @@ def check_scene(scene: mi.Scene, owner: str) -> None:
             )
 
 
+def sensor_of(scene: mi.Scene, sensor: mi.Sensor | int) -> mi.Sensor:
+    """A sensor as it is, or that of an index in the scene; ``ValueError`` if there is none such."""
+    if isinstance(sensor, mi.Sensor):
+        return sensor
+    sensors = scene.sensors()
+    if not sensors:
+        raise ValueError("the scene has no sensor; add one")
+    if not 0 <= sensor < len(sensors):
+        raise ValueError(
+            f"there is no sensor {sensor} (-s/--sensor): the scene has {len(sensors)}; count from 0"
+        )
+    return sensors[sensor]
+
+
 def check_size(sensor: mi.Sensor, spp: int) -> None:
     """Raise ``ValueError`` for pictures without pixels or samples; 0 ``spp`` are the sampler's."""
     width, height = (int(n) for n in sensor.film().crop_size())

@@ -328,7 +328,7 @@ def test_bake_leaves_other_clusters_as_they_are(tmp_path):
         (("--set", "max_depth=deep"), "give it as integer"),
         (("--set", "cache_file=state.exr"), "path has no such parameter: pass --integrator envmap"),
         (("--integrator", "no_such_plugin"), '"no_such_plugin" not found'),
-        (("-s", "1"), "-s/--sensor 1 is out of range"),
+        (("-s", "1"), "there is no sensor 1 (-s/--sensor): the scene has 1; count from 0"),
         (("-t", "0"), "-t/--threads must be at least 1"),
         (("--spp", "-1"), "--spp must not be negative"),
         (("-o", "picture.png"), "must end in .exr"),

@@ -125,6 +125,10 @@ def test_a_scene_made_in_python(tmp_path):
     assert "--set desk.shapes=ball" in text and "spp: 4" in text
     with pytest.raises(ValueError, match="has nothing to inspect"):
         write_page(path, load(room()), mi.load_dict({"type": "path"}))
+    with pytest.raises(ValueError, match="the scene has no sensor; add one"):
+        write_page(path, load(room(sensor=None)))
+    write_page(path, load(room()), spp=4)
+    assert "integrator: EnvmapHybrid[" in path.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(

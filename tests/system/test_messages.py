@@ -227,8 +227,9 @@ def too_many_samples(s: Surroundings) -> None:
     ours.render(load(room()), spp=9)
 
 
-def progressive_by_another_sampler(_: Surroundings) -> None:
-    integrator("one_level_path", sampler="independent").progressive(load(room()))
+def progressive(sampler: str = "coherent", **asked: object) -> Callable:
+    ours = "one_level_path"
+    return lambda _: integrator(ours, sampler=sampler).progressive(load(room()), **asked)
 
 
 def resumed(change: Callable[[dict, dict], object], seed: int = 0) -> Callable:
@@ -701,7 +702,11 @@ CASES = {
     "spp": Case(shell(commands.render, spp=-1), "--spp", "-1", "must not be negative"),
     "threads": Case(shell(commands.render, threads=0), "--threads", "0", "must be at least 1"),
     "mode": Case(shell(commands.render, mode="gpu"), "variant", '"gpu"', "choose from"),
-    "sensor": Case(shell(commands.render, sensor=1), "--sensor", "1", "the scene has 1 sensor(s)"),
+    "sensor": Case(shell(commands.render, sensor=1), "--sensor", "sensor 1", "the scene has 1; "),
+    "no sensors": Case(
+        lambda _: integrator("one_level_path").render(load(room(sensor=None))),
+        "the scene", "no sensor", "add one",
+    ),
     "output": Case(shell(commands.bake, output="b.png"), "output", "b.png", "must end in .exr"),
     "page": Case(shell(commands.inspect, output="b.exr"), "output", "b.exr", "must end in .html"),
     "spp of a page": Case(
@@ -738,8 +743,13 @@ CASES = {
     "no time": Case(
         shell(commands.render, integrator="envmap_hybrid", time=0.0), "--time", "0.0", "above 0"
     ),
+    "no samples a pass": Case(progressive(spp=0), "one_level_path", '"spp"', "at least 1, not 0"),
+    "a negative error": Case(
+        progressive(target_error=-1.0), '"target_error" or --target-error', "-1.0", "left out"
+    ),
     "samples that end": Case(
-        progressive_by_another_sampler, "one_level_path", '"sampler" independent', "leave it out"
+        progressive(sampler="independent"),
+        "one_level_path", '"sampler" independent', "leave it out",
     ),
     # ---- Workers ----
     "a worker of another version": Case(

@@ -176,6 +176,35 @@ def test_samplers_that_end(scene):
         ours(sampler="multijitter").progressive(scene)
 
 
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"spp": 0},
+        {"total": 0},
+        {"total": -5},
+        {"seconds": 0},
+        {"seconds": -1},
+        {"seconds": np.nan},
+        {"target_error": -1},
+    ],
+    ids=str,
+)
+def test_numbers_that_ask_for_no_picture(scene, asked):
+    ((name, value),) = asked.items()
+    with pytest.raises(ValueError, match=f'^envmap_hybrid: "{name}" .*must be .*, not {value}$'):
+        ours().progressive(scene, **asked)
+
+
+def test_sensors_are_counted_from_0(scene):
+    plugin = ours()
+    for action in (plugin.progressive, plugin.render, plugin.prepare):
+        for sensor in (7, -1):
+            with pytest.raises(ValueError, match=f"there is no sensor {sensor} .*; count from 0"):
+                action(scene, sensor)
+        with pytest.raises(ValueError, match="the scene has no sensor; add one"):
+            action(load(room(sensor=None)), 0)
+
+
 def test_no_bias_with_residuals(scene):
     plugin = ours(residual_probability=0.5)
     end = last(plugin.progressive(scene, spp=8, total=128))
