@@ -98,10 +98,7 @@ class StateKey:
         theirs, ours = _flat(settings), _flat(_plain(self.settings))
         for name in ours | theirs:
             if theirs.get(name) != ours.get(name) and name.rpartition(".")[0] not in but:
-                return (
-                    f"made with {name}={theirs.get(name)!r}, not {name}={ours.get(name)!r} "
-                    "(pass the same settings as there)"
-                )
+                return _refusal(name, theirs.get(name), ours.get(name))
         return ""
 
 
@@ -278,6 +275,38 @@ def _flat(settings: dict[str, Any]) -> dict[str, Any]:
         its = request if isinstance(request, dict) else {"": request}  # Files may hold anything.
         found |= {f"{its.get('name')}.{name}": value for name, value in its.items()}
     return found
+
+
+#: Names and values that users give settings, where these have others.
+_AS_GIVEN = {
+    "map_samples": ("baker.samples", {}),
+    "map_shadow_samples": ("baker.shadow_samples", {}),
+    "map_mirrors": ("mirrors", {"True": "map", "False": "trace"}),
+    "map_always": ("maps", {"True": "always", "False": "auto"}),
+}
+
+
+def _refusal(name: str, theirs: Any, ours: Any) -> str:
+    """How a setting of ``_flat`` differs, and what to do, in words that users know."""
+    if name == "maps":
+        kind = "with maps (envmap_hybrid)" if theirs else "without maps (such as one_level_path)"
+        return f"made for an integrator {kind} (use such a one)"
+    if name == "least_patch_samples":
+        return "made for another integrator (use the same one)"
+    cluster, _, part = name.rpartition(".")
+    if part == "name" and ours is None:
+        return (
+            f'made with the cluster "{cluster}" listed, not without (pass the same --set '
+            f'{cluster}.shapes=…, or nest the same <emitter type="mipmap_cube" id="{cluster}">)'
+        )
+    if part == "name":
+        return f'made without the cluster "{cluster}" (leave its mipmap_cube or --set out)'
+    name, words = _AS_GIVEN.get(name, (name, {}))
+    made, asked = (
+        f"{name}={words.get(str(value), value)!r}" if value is not None else f"no {name}"
+        for value in (theirs, ours)
+    )
+    return f"made with {made}, not {asked} (pass the same settings as there)"
 
 
 def _image(values: np.ndarray) -> np.ndarray:

@@ -63,22 +63,47 @@ def test_what_is_excluded_is_left_out_of_automatic_clusters(scene):
 @pytest.mark.parametrize(
     ("changes", "difference"),
     [
-        ({"two": {"resolution": 8}}, "made with two.resolution=None, not two.resolution=8"),
+        ({"two": {"resolution": 8}}, "made with no two.resolution, not two.resolution=8"),
         ({"two": {"center": [0, 0, 0]}}, r"not two.center=\[0.0, 0.0, 0.0\]"),
         ({"two": {"distance_ratio": 3}}, "two.distance_ratio=1.5, not two.distance_ratio=3"),
         ({"two": {"shapes": "lamp"}}, r"made with two.shapes=\['ball'\], not two.shapes="),
         ({"no_cluster": "lamp"}, r"made with no_cluster=\[\], not no_cluster=\['lamp'\]"),
-        ({"three": cluster("lamp")}, "made with three.name=None, not three.name='three'"),
+        ({"three": cluster("lamp")}, 'made without the cluster "three"'),
+        ({"two": None}, 'made with the cluster "two" listed, not without .*--set two.shapes='),
+        ({"baker": {"type": "envmap_bake", "samples": 4}}, "made with baker.samples="),
+        ({"mirrors": "map"}, "made with mirrors='trace', not mirrors='map'"),
+        ({"maps": "auto"}, "made with maps='always', not maps='auto'"),
     ],
 )
 def test_a_state_for_other_clusters_is_refused(scene, tmp_path_factory, changes, difference):
     path = tmp_path_factory.getbasetemp() / "clusters.exr"
     if not path.is_file():
         integrator("envmap_hybrid", **SMALL, **clusters()).prepare(scene).save(path)
-    asked = clusters(**changes.get("two", {})) | {k: v for k, v in changes.items() if k != "two"}
-    reader = integrator("envmap_hybrid", **SMALL, **asked, cache_file=str(path))
+    asked = clusters(**changes.get("two") or {}) | {k: v for k, v in changes.items() if k != "two"}
+    if "two" in changes and not changes["two"]:
+        del asked["two"]
+    reader = integrator("envmap_hybrid", **SMALL | asked, cache_file=str(path))
     with pytest.raises(ValueError, match=difference):
         reader.prepare(scene)
+
+
+def test_a_state_for_another_integrator_is_refused(scene, tmp_path):
+    path, kinds = tmp_path / "state.exr", ("envmap_hybrid", "one_level_path", "source_selection")
+    reasons = {}
+    for made in kinds:
+        integrator(made, patches=64).prepare(scene).save(path)
+        for asked in kinds:
+            reader = integrator(asked, patches=64, cache_file=str(path))
+            if asked == made:
+                reader.prepare(scene)
+                continue
+            with pytest.raises(
+                ValueError, match="made for .* integrator.*; make it again"
+            ) as caught:
+                reader.prepare(scene)
+            reasons[made, asked] = str(caught.value)
+    assert "with maps (envmap_hybrid)" in reasons["envmap_hybrid", "one_level_path"]
+    assert "without maps" in reasons["one_level_path", "envmap_hybrid"]
 
 
 # ---------------------- From the shell ----------------------
