@@ -80,11 +80,20 @@ class CachedIntegrator(mi.SamplingIntegrator):
     SHADOW_SAMPLES = 2
     """By default: shared irradiance has little noise, so direct light is worth a ray more."""
 
+    HAS_MAPS = False
+    """Only maps are asked for and baked by nested plugins."""
+
     def __init__(self, props: mi.Properties):
         check_variant(props.plugin_name())
         super().__init__(props)
         parameters = Parameters(props)
         self.owner = parameters.owner
+        if not self.HAS_MAPS:
+            for _, child in props.objects():
+                raise TypeError(
+                    f'{self.owner}: has no maps, so the nested {child.class_name()} "{child.id()}" '
+                    "is for nothing; use envmap_hybrid, or remove it"
+                )
         self.patches = parameters.integer("patches", None, 16, 1 << 22)
         self.patch_samples = parameters.power_of_two("patch_samples", None, 1, 1 << 16)
         self.shadow_samples = parameters.integer("shadow_samples", self.SHADOW_SAMPLES, 1, 1 << 16)

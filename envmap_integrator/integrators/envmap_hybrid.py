@@ -146,6 +146,8 @@ class EnvmapHybrid(GatheringIntegrator):
             'desk': {'type': 'mipmap_cube', 'shapes': 'table, ball', 'center': [0, 1, 0.5]}
     """
 
+    HAS_MAPS = True
+
     def __init__(self, props: mi.Properties):
         super().__init__(props)
         parameters = Parameters(props)

@@ -61,6 +61,12 @@ def test_parameters(settings, message):
     assert message in complaint(integrator, "envmap_hybrid", **settings)
 
 
+@pytest.mark.parametrize("kind", ["one_level_path", "source_selection", "envmap_bake"])
+def test_only_maps_take_nested_plugins(kind):
+    for nested in (cluster("ball"), {"type": "envmap_bake"}):
+        assert f"{kind}: has no maps, " in complaint(integrator, kind, nested=nested)
+
+
 # ---------------------- Scenes ----------------------
 
 

@@ -522,6 +522,10 @@ CASES = {
         lambda _: integrator("envmap_hybrid", cube={"type": "point"}),
         "envmap_hybrid", 'PointLight "cube"', "must be one envmap_bake or a mipmap_cube",
     ),
+    "nested without maps": Case(
+        lambda _: integrator("one_level_path", desk=cluster("ball")),
+        "one_level_path", 'the nested Emitter "desk"', "use envmap_hybrid",
+    ),
     "to_world": Case(
         lambda _: emitter(shapes="a", to_world=mi.ScalarTransform4f())(_),
         'mipmap_cube "sky"', '"to_world"', "remove it",
