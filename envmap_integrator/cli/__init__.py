@@ -114,7 +114,8 @@ class _Parser(argparse.ArgumentParser):
     def __init__(self, **settings):
         if "description" in settings:
             settings["description"] = fill(" ".join(settings["description"].split()), 88)
-        super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, **settings)
+        shown = argparse.RawDescriptionHelpFormatter
+        super().__init__(formatter_class=shown, allow_abbrev=False, **settings)
 
     def error(self, message: str) -> NoReturn:
         self.exit(EXIT_BAD_INPUT, f"{self.prog}: {message} (see --help)\n")

@@ -329,6 +329,7 @@ def test_bake_leaves_other_clusters_as_they_are(tmp_path):
         (("--set", "cache_file=state.exr"), "path has no such parameter: pass --integrator envmap"),
         (("--integrator", "no_such_plugin"), '"no_such_plugin" not found'),
         (("-s", "1"), "there is no sensor 1 (-s/--sensor): the scene has 1; count from 0"),
+        (("--sp", "3"), "unrecognized arguments: --sp 3"),
         (("-t", "0"), "-t/--threads must be at least 1"),
         (("--spp", "-1"), "--spp must not be negative"),
         (("-o", "picture.png"), "must end in .exr"),
