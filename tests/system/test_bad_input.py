@@ -117,6 +117,18 @@ def test_clusters(shapes, message):
     assert "\n" not in error
 
 
+def test_names_of_shapes_that_are_near_come_first():
+    """And what merging has taken is said where something has been merged."""
+    parts = {f"part{i}": ball(0, 0, 0, 0.1 + i / 100) for i in range(20)}
+    error = complaint(prepare, room(**parts), desk=cluster("blok"))
+    assert '"blok"; it has "block", "' in error
+    assert error.endswith(" … (24 in all)")
+    pane = {"type": "rectangle", "bsdf": {"type": "ref", "id": "grey"}}
+    merged = mi.load_dict(room(grey={"type": "diffuse"}, one=pane, two=pane))
+    error = complaint(integrator("envmap_hybrid", desk=cluster("one")).prepare, merged)
+    assert " (load with optimize=False: Mitsuba merges " in error
+
+
 # ---------------------- Cache files ----------------------
 
 

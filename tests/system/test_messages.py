@@ -560,10 +560,10 @@ CASES = {
         lambda s: scene(sensor=camera(medium=MEDIUM))(s),
         'sensor "sensor"', "medium", "remove it or use volpath",
     ),
-    "unknown shape": Case(listed("bal"), 'mipmap_cube "desk"', '"bal"', "optimize=False"),
+    "unknown shape": Case(listed("bal"), 'mipmap_cube "desk"', '"bal"', 'it has "ball"'),
     "unknown exception": Case(
         lambda _: integrator("envmap_hybrid", **SETTINGS, no_cluster="bal").prepare(load(room())),
-        'envmap_hybrid: "no_cluster"', '"bal"', "optimize=False",
+        'envmap_hybrid: "no_cluster"', '"bal"', 'it has "ball"',
     ),
     "listed and excluded": Case(
         lambda _: integrator("envmap_hybrid", **SETTINGS, no_cluster="ball"),

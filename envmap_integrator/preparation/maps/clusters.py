@@ -7,7 +7,7 @@ material, so one shape may be all the woodwork of a house.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from difflib import SequenceMatcher
+from difflib import get_close_matches
 
 import drjit as dr
 import mitsuba as mi
@@ -29,6 +29,8 @@ VOXEL = 1 / 40
 #: A cluster seen by less than this fraction of the sensors' rays isn't worth a map.
 MIN_SEEN = 0.005
 MAX_CLUSTERS = 8
+#: Names that are listed in messages at most, and how much alike (0 … 1) two have to be to be near.
+MOST_NAMES, ALIKE = 8, 0.4
 #: Voxels considered, most seen first: bounds the cost of hierarchical clustering.
 MAX_VOXELS = 1500
 #: Part of the time of a render that looking for maps and reading them takes, without which the same
@@ -111,11 +113,18 @@ def shapes_named(scene: mi.Scene, names: tuple[str, ...], owner: str) -> np.ndar
     ids = [shape.id() for shape in shapes]
     for name in names:
         if name not in ids:
-            # Those first that are most alike.
-            known = sorted(ids, key=lambda id_: -SequenceMatcher(None, name, id_).ratio())
+            known = [id_ for id_ in ids if id_]
+            nearest = get_close_matches(name, known, MOST_NAMES, ALIKE)
+            known = list(dict.fromkeys([*nearest, *known]))
+            # The command line doesn't merge where shapes are named.
+            merged = any(shape.class_name() == "Mesh" and not shape.id() for shape in shapes)
             raise ValueError(
-                f'{owner}: the scene has no shape "{name}"; it has {_some(known)} '
-                "(in Python, load with optimize=False: Mitsuba merges meshes that share a material)"
+                f'{owner}: the scene has no shape "{name}"; it has {_some(known) or "no ids"}'
+                + (
+                    " (load with optimize=False: Mitsuba merges meshes that share a material)"
+                    if merged
+                    else ""
+                )
             )
     return lasting_ids(shapes)[np.isin(ids, names)]
 
@@ -252,5 +261,5 @@ def _holds(cluster: Cluster, low, high) -> bool:
 
 
 def _some(names) -> str:
-    listed = ", ".join(f'"{name}"' for name in names[:8])
-    return listed + (f", … ({len(names)} in all)" if len(names) > 8 else "")
+    listed = ", ".join(f'"{name}"' for name in names[:MOST_NAMES])
+    return listed + (f", … ({len(names)} in all)" if len(names) > MOST_NAMES else "")
