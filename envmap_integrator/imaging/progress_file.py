@@ -72,7 +72,7 @@ class Progress:
 
 def stored_progress(path: str | os.PathLike) -> Stored:
     """The file; ``StorageError`` if it's missing, damaged, or of another format."""
-    return read(path, "begin anew, without resume")
+    return read(path, "begin anew, without resume or --resume")
 
 
 def planned_samples(stored: Stored) -> int:

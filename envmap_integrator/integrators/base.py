@@ -46,6 +46,7 @@ from ..system.checks import (
 )
 from ..system.interrupt import interruptible
 from ..system.parameters import Parameters
+from ..system.printed import printed
 from ..system.recording import Recorder
 from ..system.spectrum import rgb, seen
 from ..transport.camera import CameraSample
@@ -379,10 +380,11 @@ class CachedIntegrator(mi.SamplingIntegrator):
             "version": envmap_integrator.__version__,
             "variant": mi.variant(),
             "scene": baked.key.scene,
-            "film": " ".join(str(sensor.film()).split()),
+            "film": sensor.film().class_name(),
+            **{f"film.{name}": text for name, text in printed(sensor.film()).items()},
             "sensor": view_name(sensor),
             "integrator": type(self).__name__,
-            **{name: " ".join(str(value).split()) for name, value in self._parameters().items()},
+            **printed(self),
             "seed": seed,
             "spp": spp,
             "cache": hashlib.blake2b(baked.cache.table.numpy(), digest_size=16).hexdigest(),

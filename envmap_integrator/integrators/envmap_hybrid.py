@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -181,6 +181,9 @@ class EnvmapHybrid(GatheringIntegrator):
                     )
         self.requests = tuple(requests)
         self.baker = self.baker or mi.load_dict({"type": "envmap_bake"})
+
+    def _parameters(self) -> dict[str, object]:
+        return super()._parameters() | {"requests": [asdict(each) for each in self.requests]}
 
     def settings(self) -> Settings:
         return super().settings(
