@@ -26,6 +26,7 @@ from envmap_integrator.inspection import page
 from envmap_integrator.system.atomic import check_writable
 from envmap_integrator.system.checks import check_size, sensor_of
 from envmap_integrator.system.llvm import ensure_llvm
+from envmap_integrator.system.printed import plain, printed
 from envmap_integrator.system.scene_file import DEFAULT_INTEGRATOR, SceneFile
 
 
@@ -304,7 +305,7 @@ def _settings(
         "seed": args.seed,
         "denoised": args.denoise,
         "integrator": scene_file.integrator.plugin_name(),
-        "integrator_settings": str(scene.integrator()),
+        "integrator_settings": {n: plain(text) for n, text in printed(scene.integrator()).items()},
     }
 
 
@@ -325,6 +326,7 @@ def _report(
     """Say what has been done, as a table or, with ``more`` of it, as JSON."""
     if args.quiet:
         return
+    seconds = seconds | {"total": sum(seconds.values())}
     if args.json:
         result = {"output": str(output), "seconds": seconds, "compilation_s": compilation} | more
         print(json.dumps(result))
@@ -332,8 +334,7 @@ def _report(
     table = Table("stage", "seconds", box=None)
     table.columns[1].justify = "right"
     for stage, duration in seconds.items():
-        table.add_row(stage, f"{duration:.2f}")
-    table.add_row("total", f"{sum(seconds.values()):.2f}", style="bold")
+        table.add_row(stage, f"{duration:.2f}", style="bold" if stage == "total" else "")
     table.add_row("of it compiling kernels", f"{compilation:.2f}", style="dim")
     console = Console()
     console.print(table)
