@@ -64,20 +64,27 @@ def _end() -> None:
 
 EXIT_CODES = """exit codes:
   0    done
-  1    doctor: nothing can be rendered with here
   2    bad input, or a file that can't be read or written: one line on stderr says what to do
   130  Ctrl-C
 """
+EXIT_CODES_OF_DOCTOR = """exit codes:
+  0    something can be rendered with here
+  1    nothing can
+"""
 RENDER_EXAMPLES = """examples:
   envmap-render render room.xml --spp 16 --denoise --png       # a look
-  envmap-render render room.xml --integrator envmap_hybrid --spp 256 -o room.exr
-  envmap-render render room.xml --progressive --time 30 --png  # better and better
-  envmap-render render room.xml --resume --time 30 --png       # goes on from there
-  envmap-render render room.xml --target-error 1e-3
-  envmap-render render room.xml --set residual_probability=0.5 # without bias, more noise
   envmap-render render room.xml -D resx=320 -s 1               # smaller, second sensor
-  envmap-render render room.xml --cluster tcp://render-1:8786  # by several machines
-  envmap-render render room.xml --json | jq .seconds
+  envmap-render render room.xml --json | jq .seconds.total
+
+  # --integrator can be left out where the scene names one of ours, or none.
+  envmap-render render room.xml --integrator envmap_hybrid --spp 256 -o room.exr
+  envmap-render render room.xml --integrator envmap_hybrid --progressive --time 30 --png
+  envmap-render render room.xml --integrator envmap_hybrid --resume --time 30 --png
+  envmap-render render room.xml --integrator envmap_hybrid --target-error 1e-3
+  envmap-render render room.xml --integrator envmap_hybrid --cluster tcp://render-1:8786
+
+  # Without bias, but with more noise:
+  envmap-render render room.xml --integrator envmap_hybrid --set residual_probability=0.5
 
 """
 BAKE_EXAMPLES = """examples:
@@ -218,7 +225,9 @@ def build_parser() -> argparse.ArgumentParser:
     convert.add_argument("--debug", action="store_true", help="show tracebacks")
     convert.set_defaults(command=export)
 
-    check = subparsers.add_parser("doctor", help="say what this machine can render with")
+    check = subparsers.add_parser(
+        "doctor", help="say what this machine can render with", epilog=EXIT_CODES_OF_DOCTOR
+    )
     check.add_argument("--debug", action="store_true", help=argparse.SUPPRESS)
     check.set_defaults(command=doctor)
     return parser

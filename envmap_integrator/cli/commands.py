@@ -56,6 +56,8 @@ def render(args: argparse.Namespace) -> int:
     _write(args, output, bitmap, settings, seconds, compilation, more)
     _report(args, seconds, compilation, output, **more, settings=settings)
     if not (args.quiet or args.json):
+        if args.png:
+            print(f"wrote {output.with_suffix('.png')}")
         print(f"by {settings['integrator']} with {settings['spp']} samples a pixel")
     return 0
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from envmap_integrator.cli import main
+from envmap_integrator.cli import RENDER_EXAMPLES, main
 from envmap_integrator.cli.output import write_bitmap
 from envmap_integrator.imaging.denoiser import denoise
 from envmap_integrator.system import progress
@@ -83,7 +84,9 @@ def test_render_writes_picture_and_header(scene, capsys):
 
     assert pixels(scene.with_suffix(".png")).dtype == np.uint8
     assert sorted(path.suffix for path in scene.parent.iterdir()) == [".exr", ".png", ".xml"]
-    assert "render" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "render" in told
+    assert f"wrote {picture}\nwrote {scene.with_suffix('.png')}\n" in told
 
 
 def test_quiet(scene, capfd):
@@ -133,8 +136,27 @@ def test_help_teaches(capsys, command):
     with pytest.raises(SystemExit, match="0"):
         run(*command, "--help")
     shown = capsys.readouterr().out
-    assert "exit codes:\n  0    done\n" in shown
+    assert "exit codes:\n  0    done\n  2    bad input" in shown
     assert not command or f"examples:\n  envmap-render {command[0]} " in shown
+
+
+def test_exit_codes_of_the_doctor(capsys):
+    with pytest.raises(SystemExit, match="0"):
+        run("doctor", "--help")
+    shown = capsys.readouterr().out
+    assert "\n  1    nothing can" in shown and "bad input" not in shown
+
+
+def test_what_help_proposes_is_for_scenes_of_any_integrator(tmp_path, monkeypatch):
+    """The same commands, for a small scene of path, with few samples."""
+    monkeypatch.chdir(tmp_path)
+    write_scene(tmp_path, PATH).rename("room.xml")
+    lines = RENDER_EXAMPLES.splitlines()
+    examples = [shlex.split(line, comments=True)[1:] for line in lines if "envmap-render" in line]
+    progressive = [words for words in examples if "--progressive" in words or "--resume" in words]
+    assert len(progressive) == 2
+    for words in progressive:
+        assert main([*words, "--spp", "17", "--set", "patches=64"]) == 0
 
 
 def test_shells_can_complete(tmp_path):
