@@ -216,14 +216,6 @@ class Stored:
             lambda v: isinstance(v, list) and len(v) == 3 and all(map(_is_finite, v)),
         )
 
-    def numbers(self, name: str) -> dict[str, float]:
-        """Numbers by name."""
-        return self._value(
-            name,
-            "numbers by name",
-            lambda v: isinstance(v, dict) and all(map(_is_finite, v.values())),
-        )
-
     def entries(self, name: str) -> list[Stored]:
         """The objects of a list, over the same parts."""
         values = self._value(

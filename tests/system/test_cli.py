@@ -218,6 +218,20 @@ def test_a_baked_state_serves_later_renders(tmp_path):
         assert run("render", scene, "--spp", 1, *options, "--set", f"cache_file={state}") == 0
 
 
+@pytest.mark.parametrize("more", [[], ["--time", 9]], ids=["at-once", "progressive"])
+def test_the_time_of_a_baked_state_is_that_of_reading_it(tmp_path, capfd, more):
+    scene, state = write_scene(tmp_path, ""), tmp_path / "state.exr"
+    assert run("bake", scene, "-o", state, "--set", "patches=256", "--quiet") == 0
+    options = ("--set", "patches=256", "--set", f"cache_file={state}", "--json", "--spp", 1)
+    assert run("render", scene, *options, *more) == 0
+    seconds = json.loads(capfd.readouterr().out)["seconds"]
+    assert list(seconds) == ["load", f"read from {state}", "render", "total"]
+    total = seconds.pop("total")
+    assert total == pytest.approx(sum(seconds.values())) and min(seconds.values()) > 0
+    kept = json.loads(header(scene.with_suffix(".exr"))["stage_times"])
+    assert list(kept) == ["load", f"read from {state}", "render"]
+
+
 def test_a_picture_can_be_denoised(scene, tmp_path):
     """As by the denoiser called by hand, on a film with a box filter."""
     output = tmp_path / "denoised.exr"

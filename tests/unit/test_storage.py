@@ -164,7 +164,6 @@ def stored(**metadata) -> Stored:
             [-1, float("nan"), float("inf"), 1e39, 10**400, True, "1", None],
         ),
         ("point", (), [[1, -2.5, 0]], [[1, 2], [1, 2, float("nan")], [1, 2, "3"], 3, None]),
-        ("numbers", (), [{"a": 1.5}, {}], [{"a": "b"}, {"a": None}, [1], None]),
         ("entries", (), [[], [{"a": 1}]], [[1], {"a": 1}, None]),
     ],
 )
