@@ -26,3 +26,13 @@ def test_objects_of_mitsuba():
     assert found["integrators.PathIntegrator.max_depth"] == "3"
     film = mi.load_dict({"type": "hdrfilm", "width": 4, "height": 5})
     assert plain(printed(film)["size"]) == [4, 5] and printed(film)["pixel_format"] == "rgb"
+
+
+def test_objects_in_a_list_are_all_there():
+    mi.set_variant("llvm_ad_spectral")
+    bands = {
+        name: {"type": "spectrum", "value": [(500, 1.0), (last, 1.0)]}
+        for name, last in (("a", 600), ("b", 650))
+    }
+    found = printed(mi.load_dict({"type": "specfilm"} | bands))
+    assert "[500, 600], [500, 650]" in found.values() and found["size"] == "[768, 576]"
