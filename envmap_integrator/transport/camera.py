@@ -12,7 +12,7 @@ from ..system.jit import opaque_point
 from ..system.ray_counts import Ray, count
 from .direct_light import WideShare, sample_emitter, sample_emitters
 from .gathered import Gathered
-from .lobes import Lobes, Scattered, is_delta, is_diffuse
+from .lobes import Lobes, Scattered, is_delta, is_diffuse, lets_all_pass
 from .path import follow, survival_probability
 from .rules import PathRules
 from .state import PathStart, camera_path
@@ -96,7 +96,7 @@ def split(
     valid = shown & (scene.environment() is not None)
     throughput, on_mirrors = mi.Spectrum(1), mi.Spectrum(0)
     if dr.hint(lookup.far_field is None or not lookup.far_field.map_mirrors, mode="scalar"):
-        mirrored = active & si.is_valid() & is_delta(si.bsdf(ray))
+        mirrored = leads_on(si, ray, active & si.is_valid())
         si, ray, throughput, on_mirrors, solid = follow_mirrors(scene, sampler, si, ray, mirrored)
         shown |= solid | (mirrored & si.is_valid())
         valid |= solid
@@ -152,7 +152,7 @@ def follow_mirrors(
     ray: mi.Ray3f,
     active: mi.Bool,
 ) -> tuple[mi.SurfaceInteraction3f, mi.Ray3f, mi.Spectrum, mi.Spectrum, mi.Bool]:
-    """Follow perfect mirrors and glass to what is seen in them.
+    """Follow perfect mirrors, glass and holes to what is seen in them.
 
     Returns an interaction, invalid where nothing is seen, the ray to it, the throughput, what the
     mirrors and the glass themselves emit [W/m²/sr], and whether anything on the way was solid.
@@ -179,8 +179,14 @@ def follow_mirrors(
         ray = dr.select(active, si.spawn_ray(si.to_world(bs.wo)), ray)
         count(Ray.UNBOUNDED, ray, active)
         si = dr.select(active, scene.ray_intersect(ray, active), si)
-        active &= si.is_valid() & is_delta(si.bsdf(ray))
+        active &= leads_on(si, ray, active & si.is_valid())
     return si, ray, throughput, emitted, solid
+
+
+def leads_on(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:
+    """Is what is seen at a surface elsewhere: in a mirror, behind glass or a hole?"""
+    bsdf = si.bsdf(ray)
+    return active & (is_delta(bsdf) | lets_all_pass(bsdf, si, active))
 
 
 def gathering(

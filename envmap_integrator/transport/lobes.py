@@ -31,6 +31,12 @@ def is_delta(bsdf: mi.BSDFPtr) -> mi.Bool:
     return mi.has_flag(flags, mi.BSDFFlags.Delta) & ~mi.has_flag(flags, mi.BSDFFlags.Smooth)
 
 
+def lets_all_pass(bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
+    """Is there a hole in a surface, by the ``mask`` that cuts it out?"""
+    cut = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
+    return cut & (dr.min(bsdf.eval_null_transmission(si, cut)) >= 1)
+
+
 def single_lobe(bsdf: mi.BSDFPtr) -> mi.Bool:
     """Does a material scatter by diffuse reflection alone?"""
     others = mi.BSDFFlags.Glossy | mi.BSDFFlags.Delta | mi.BSDFFlags.DiffuseTransmission

@@ -125,6 +125,18 @@ def test_textures_behind_a_pane_stay_sharp(variant):
     assert_texels_stay(load(room(walls=box(2.0) | grey(0.9), block=None, ball=None, **parts)))
 
 
+def test_what_is_seen_through_holes_is_shared(variant):
+    tilted = at(0, -1.2, -0.4).rotate([1, 0, 0], 60).scale(1.5)
+    holes = {"type": "checkerboard", "to_uv": scaled(2)}
+    holes |= {"color0": colour(0), "color1": colour(1)}
+    cut = {"type": "mask", "opacity": holes, "paint": {"type": "twosided"} | grey(0.5)}
+    grid = {"type": "rectangle", "to_world": tilted, "bsdf": cut}
+    scene = load(room(grid=grid, sensor=camera(64, 48)))
+    apart, shared = (pictures(scene, irradiance_filter=on) for on in (False, True))
+    noise = [np.var(some, axis=0)[24:].mean() for some in (apart, shared)]
+    assert noise[1] < noise[0] / 3
+
+
 def assert_texels_stay(scene):
     apart = np.mean(pictures(scene, 256, irradiance_filter=False), axis=0).mean(axis=2)
     shared = np.mean(pictures(scene, 32, irradiance_filter=True), axis=0).mean(axis=2)
