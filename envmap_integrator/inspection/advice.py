@@ -15,8 +15,10 @@ from .survey import ClusterView, Survey
 ERROR, TRACED_ON, UNKNOWN = 0.01, 0.25, 0.15
 #: The same of the texels of a map that nothing reaches.
 MASKED = 0.9
-#: Shapes of a cluster that are named at most.
+#: Shapes of a cluster that are named at most, but for those to be listed.
 MOST_SHAPES = 6
+#: From which part of a cluster on shapes stand for all of it.
+MOST = 0.95
 
 
 def percent(share: float) -> str:
@@ -73,11 +75,11 @@ def about_cluster(view: ClusterView) -> list[str]:
     ratio = f"distance_ratio (here {cluster.half_width / cluster.radius:.3g})"
     found = []
     if view.seen == 0:
-        found.append("This sensor doesn't see it: no_cluster leaves its shapes out.")
+        found.append(f"This sensor doesn't see it. {_leave_out(view)}")
     if cached > mapped and traced > TRACED_ON:
         found.append(
             "Few rays come to use the map, with this cube, a smaller or a larger one: many hit "
-            "something inside it, and many are traced on. no_cluster leaves its shapes out."
+            f"something inside it, and many are traced on. {_leave_out(view)}"
         )
     elif cached > mapped:
         found.append(
@@ -98,34 +100,89 @@ def about_cluster(view: ClusterView) -> list[str]:
     return found or ["Nothing odd."]
 
 
+def _leave_out(view: ClusterView) -> str:
+    if view.members.request:
+        return f"Take {view.cluster.name} out of the integrator."
+    return "no_cluster leaves its shapes out."
+
+
+def about_listing(view: ClusterView) -> list[str]:
+    """What of a cluster can't be asked for by hand, and why."""
+    members, found = view.members, []
+    if members.share < MOST:
+        found.append(f"The shapes that can be listed are {percent(members.share)} of the cluster.")
+    if members.pieces:
+        names = ", ".join(members.pieces[:MOST_SHAPES])
+        more = len(members.pieces) - MOST_SHAPES
+        found.append(
+            "Left out, as of these the cluster has a piece only: "
+            + (f"{names}, and {more} more." if more > 0 else f"{names}.")
+        )
+    if members.unnamed:
+        found.append(
+            ("1 shape" if members.unnamed == 1 else f"{members.unnamed} shapes")
+            + " without an id can't be listed: "
+            + ("give it one" if members.unnamed == 1 else "give them one")
+            + " (in Python, load with optimize=False: Mitsuba merges meshes that share a material)."
+        )
+    return found
+
+
 def as_xml(view: ClusterView) -> str:
     """A ``mipmap_cube`` that asks for the same cluster, to be changed by hand.
 
-    Nothing if its shapes have no ids.
+    Nothing if none of its shapes can be listed.
     """
-    cluster = view.cluster
-    ids = _ids(view)
-    if not ids:
+    if not view.members.listed:
         return ""
+    lines = [
+        f'<string name="shapes" value={quoteattr(", ".join(view.members.listed))}/>',
+        f'<float name="distance_ratio" value="{_ratio(view)}"/>',
+    ]
+    if center := _center(view):
+        axes = " ".join(f'{axis}="{c}"' for axis, c in zip("xyz", center, strict=True))
+        lines.append(f'<point name="center" {axes}/>')
+    if resolution := _resolution(view):
+        lines.append(f'<integer name="resolution" value="{resolution}"/>')
     return (
-        f'<emitter type="mipmap_cube" id={quoteattr(cluster.name)}>\n'
-        f'    <string name="shapes" value={quoteattr(ids)}/>\n'
-        f'    <float name="distance_ratio" value="{cluster.half_width / cluster.radius:.3g}"/>\n'
-        "</emitter>"
+        "\n    ".join([f'<emitter type="mipmap_cube" id={quoteattr(view.cluster.name)}>', *lines])
+        + "\n</emitter>"
     )
 
 
 def as_flags(view: ClusterView) -> str:
-    """Flags of ``envmap-render`` that ask for the same, and that leave its shapes out."""
-    cluster, ids = view.cluster, _ids(view)
-    if not ids:
+    """Flags of ``envmap-render`` that ask for the same; nothing likewise."""
+    if not view.members.listed:
         return ""
-    name, ratio = shlex.quote(cluster.name), cluster.half_width / cluster.radius
-    return (
-        f"--set {name}.shapes={shlex.quote(ids)} --set {name}.distance_ratio={ratio:.3g}\n"
-        f"--set no_cluster={shlex.quote(ids)}"
+    values = {"shapes": ", ".join(view.members.listed), "distance_ratio": _ratio(view)}
+    if center := _center(view):
+        values["center"] = ",".join(center)
+    if resolution := _resolution(view):
+        values["resolution"] = str(resolution)
+    return " ".join(
+        f"--set {shlex.quote(f'{view.cluster.name}.{name}={value}')}"
+        for name, value in values.items()
     )
 
 
-def _ids(view: ClusterView) -> str:
-    return ", ".join(list(filter(None, view.shapes))[:MOST_SHAPES])
+def without(view: ClusterView) -> str:
+    """The flag that leaves the shapes of an automatic cluster out; nothing if there are none."""
+    members = view.members
+    if members.request or not members.listed:
+        return ""
+    return f"--set no_cluster={shlex.quote(', '.join(members.listed))}"
+
+
+def _ratio(view: ClusterView) -> str:
+    return f"{view.cluster.half_width / view.cluster.radius:g}"
+
+
+def _center(view: ClusterView) -> list[str]:
+    """That of a listed cluster that sets it."""
+    request = view.members.request
+    return [f"{c:.9g}" for c in (request and request.center) or ()]
+
+
+def _resolution(view: ClusterView) -> int | None:
+    request = view.members.request
+    return request and request.resolution

@@ -45,7 +45,8 @@ class Shown:
     radiance, distance  URIs of its unfolded map
     near, far        ends of the scale of distances
     shapes           its largest shapes, and how many there are
-    remarks, xml, flags  see ``advice``
+    remarks, unlisted  what is odd about it, and what of it can't be listed: see ``advice``
+    xml, flags, without  how to ask for it, and to leave it out: see ``advice``
     """
 
     view: ClusterView
@@ -58,8 +59,10 @@ class Shown:
     shapes: list[tuple[str, float]]
     n_shapes: int
     remarks: list[str]
+    unlisted: list[str]
     xml: str
     flags: str
+    without: str
 
 
 def inspect(
@@ -196,8 +199,10 @@ def _clusters(view: View, scene: mi.Scene, sensor: mi.Sensor) -> list[Shown]:
                 shapes=shapes[: advice.MOST_SHAPES],
                 n_shapes=len(shapes),
                 remarks=advice.about_cluster(cluster),
+                unlisted=advice.about_listing(cluster),
                 xml=advice.as_xml(cluster),
                 flags=advice.as_flags(cluster),
+                without=advice.without(cluster),
             )
         )
     return shown

@@ -16,14 +16,16 @@ from ..lookup.cube_map import Cluster
 from ..lookup.ids import ObjectIds
 from ..lookup.patches import DROPPED, MARK_BITS, UNEVEN
 from ..preparation.baked_state import BakedState
+from ..preparation.coarse_mesh.surface_points import scatter_points
 from ..system.ray_counts import count_rays
 from ..system.scene_order import lasting_ids, ordered_shapes
 from ..system.warned import warned
+from .members import Members, find_members
 
 #: Samples per pixel of the picture, in two passes, and of the AOVs.
 PICTURE_SPP, AOV_SPP = 16, 4
-#: Rays that look for the shapes of a cluster that isn't seen.
-N_RAYS = 1 << 14
+#: Points all over the scene that tell the shapes of clusters.
+N_POINTS = 1 << 17
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,7 @@ class ClusterView:
 
     cluster   the cluster
     masked    part of its map's texels that no ray of it was seen to reach
+    members   what it is made of
     shapes    part of the picture by the ids of its shapes, largest first; 0 for all if none of
               them is seen
     seen      part of the picture that shows it
@@ -41,6 +44,7 @@ class ClusterView:
 
     cluster: Cluster
     masked: float
+    members: Members
     shapes: dict[str, float]
     seen: float
     served: tuple[float, float, float]
@@ -160,33 +164,47 @@ def _view(scene, sensor, integrator, spp, seed, types: tuple[str, ...]) -> View:
         aovs[kind] = channels[..., begin:end]
         begin = end
     state = integrator.prepare(scene, sensor, spp)
-    return View(state, aovs, _clusters(scene, sensor, state, aovs["served"], aovs["near"]))
+    return View(state, aovs, _clusters(scene, sensor, integrator, state, aovs))
 
 
-def _clusters(scene, sensor, state: BakedState, served, near) -> list[ClusterView]:
+def _clusters(scene, sensor, integrator, state: BakedState, aovs) -> list[ClusterView]:
     """What the rays through the centres of the pixels find of each cluster."""
     if not state.maps:
         return []
-    height, width = served.shape[:2]
+    height, width = aovs["served"].shape[:2]
     y, x = np.indices((height, width), np.float32).reshape(2, -1) + 0.5
     place = mi.Point2f(x / width, y / height)
     ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, place, mi.Point2f(0.5))
-    cluster, object_id = _hit(scene, state, mi.Ray3f(ray))
+    object_ids = ObjectIds.of(scene)
+    si = scene.ray_intersect(mi.Ray3f(ray))
+    normal = dr.mulsign(si.n, -dr.dot(si.n, ray.d))
+    object_id = object_ids(si)
+    cluster = _cluster_at(state, si.p, normal, object_id, si.is_valid())
+    sensors = scene.sensors()
+    if sensor not in sensors:
+        sensors = [*sensors, sensor]
+    mirrors = integrator.settings().map_mirrors
+    points = scatter_points(scene, object_ids, N_POINTS, sensors, mirrors)
+    cluster_of_point = _cluster_at(state, *points.places(), mi.Bool(True))
+    members = find_members(scene, state, points, cluster_of_point, integrator.requests)
     shapes = ordered_shapes(scene)
     names = {its: shape.id() for its, shape in zip(lasting_ids(shapes), shapes, strict=True)}
-    served, near = served.reshape(-1, 3), near.ravel()
+    object_id = object_id.numpy()
+    served, near = aovs["served"].reshape(-1, 3), aovs["near"].ravel()
     found = []
-    for index, cube_map in enumerate(state.maps):
+    for index, (cube_map, its) in enumerate(zip(state.maps, members, strict=True)):
         there = cluster == index
-        seen = _ranked(object_id[there])
-        ids = {names[its]: count / len(there) for its, count in seen.items()}
-        if not seen:
-            its, hit = _hit(scene, state, _rays_at(cube_map.cluster))
-            ids = dict.fromkeys((names[i] for i in _ranked(hit[its == index])), 0.0)
+        seen = dict.fromkeys(_ranked(points.object_id[cluster_of_point == index]), 0)
+        if there.any():
+            seen = _ranked(object_id[there])
+        ids: dict[str, float] = {}
+        for number, count in seen.items():
+            ids[names[number]] = ids.get(names[number], 0.0) + count / len(there)
         found.append(
             ClusterView(
                 cube_map.cluster,
                 cube_map.masked,
+                its,
                 ids,
                 float(there.mean()),
                 tuple(served[there].mean(axis=0).tolist()) if there.any() else (0.0, 0.0, 0.0),
@@ -196,24 +214,11 @@ def _clusters(scene, sensor, state: BakedState, served, near) -> list[ClusterVie
     return found
 
 
-def _hit(scene, state: BakedState, ray: mi.Ray3f) -> tuple[np.ndarray, np.ndarray]:
-    """Cluster and shape of what rays hit; the number of clusters stands for none."""
-    si = scene.ray_intersect(ray)
-    normal = dr.mulsign(si.n, -dr.dot(si.n, ray.d))
-    object_id = ObjectIds.of(scene)(si)
-    cell = state.cache.patches.locate(si.p, normal, object_id, si.is_valid())
+def _cluster_at(state: BakedState, p, normal, object_id, active) -> np.ndarray:
+    """Cluster of each surface point; the number of clusters stands for none."""
+    cell = state.cache.patches.locate(p, normal, object_id, active)
     cluster = state.cluster_of_cell[cell.index.numpy()]
-    return np.where(cell.found.numpy(), cluster, len(state.maps)), object_id.numpy()
-
-
-def _rays_at(cluster: Cluster) -> mi.Ray3f:
-    """Rays all through a cluster, for those that no sensor sees."""
-    rng, radius = np.random.default_rng(0), cluster.radius
-    places = rng.uniform(-1, 1, (2, N_RAYS, 3))
-    begin, end = cluster.centre + radius * places
-    direction = (end - begin) / np.maximum(np.linalg.norm(end - begin, axis=1, keepdims=True), 1e-9)
-    origin, direction = (mi.Point3f(x.T.astype(np.float32)) for x in (begin, direction))
-    return mi.Ray3f(origin, mi.Vector3f(direction))
+    return np.where(cell.found.numpy(), cluster, len(state.maps))
 
 
 def _ranked(ids: np.ndarray) -> dict[int, int]:

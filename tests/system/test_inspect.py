@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import html
 import json
 import re
 import shlex
@@ -15,7 +16,8 @@ import numpy as np
 import pytest
 
 from envmap_integrator.cli import main
-from envmap_integrator.inspection.advice import about_cluster, as_flags, as_xml, in_short
+from envmap_integrator.inspection.advice import about_cluster, as_flags, as_xml, in_short, without
+from envmap_integrator.inspection.members import Members
 from envmap_integrator.inspection.page import inspect as write_page
 from envmap_integrator.inspection.pictures import RAMP, embedded, on_ramp, shrunk, tone_mapped
 from envmap_integrator.inspection.survey import ClusterView, survey
@@ -23,7 +25,8 @@ from envmap_integrator.inspection.unfolded import MASKED, SKY, Faces, unfolded
 from envmap_integrator.inspection.wires import wires
 from envmap_integrator.lookup.cube import face_to_direction
 from envmap_integrator.lookup.cube_map import Cluster, CubeMap
-from tests.helpers import camera, cluster, integrator, load, room
+from envmap_integrator.system.warned import warned
+from tests.helpers import block, camera, cluster, colour, grey, integrator, load, room
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -103,6 +106,69 @@ def test_maps_that_were_not_made_are_shown(tmp_path):
     assert "maps = auto" in text
 
 
+SHARED = """<shape type="cylinder" id="bar"> <point name="p0" x="-1.8" y="1" z="-1.2"/>
+    <point name="p1" x="1.8" y="1" z="-1.2"/> <float name="radius" value="0.2"/> </shape>
+    <shape type="sphere"> <point name="center" x="0.9" y="0.6" z="-1.7"/>
+    <float name="radius" value="0.3"/> </shape>
+    <shape type="sphere" id="left"> <point name="center" x="-1.5" y="0.6" z="-1.7"/>
+    <float name="radius" value="0.3"/> </shape>"""
+
+
+def test_what_is_given_to_paste_is_accepted(tmp_path):
+    """Each cluster alone and all together, of shapes that clusters share and such without id."""
+    text = html.unescape(inspect(tmp_path, SHARED, "--set", "maps=always"))
+    flags = re.findall(r"<pre>(--set .*\.shapes=.*)</pre>", text)
+    assert len(flags) == 3  # The lamp is the third.
+    listed = re.findall(r"\w+\.shapes=([^']*?)'? --set", " ".join(flags))
+    assert {"ball & co", "left"} <= {name for names in listed for name in names.split(", ")}
+    assert "bar" not in " ".join(listed) and "walls" not in " ".join(listed)
+    assert "the cluster has a piece only: bar" in text
+    assert "1 shape without an id can't be listed: give it one" in text
+    for pasted in (*flags, " ".join(flags)):
+        options = ["--spp", "1", "--set", "patches=512", "--quiet", *shlex.split(pasted)]
+        with warned() as warnings:
+            assert main(["render", str(tmp_path / "room.xml"), *options]) == 0
+        assert not any("there is nothing to map" in warning for warning in warnings)
+    excluded = re.findall(r"<pre>--set no_cluster=(.*)</pre>", text)
+    assert len(excluded) == 3 and "bar" not in " ".join(excluded)
+
+
+def test_nothing_is_given_to_paste_where_nothing_can_be_listed(tmp_path):
+    """Shapes that Mitsuba has merged have no ids."""
+    path = tmp_path / "page.html"
+    one, other = (block(x, 0.5, -1.6, 0.4) | grey(0.7) for x in (-0.5, 0.4))
+    light = {"type": "point", "position": [0, 0, 1], "intensity": colour(5)}
+    scene = mi.load_dict(room(block=one, ball=other, lamp=None, light=light), optimize=True)
+    assert "" in [shape.id() for shape in scene.shapes()]
+    write_page(path, scene, integrator("envmap_hybrid", sampler="coherent"), spp=4)
+    text = html.unescape(path.read_text(encoding="utf-8"))
+    assert "can't be asked for by hand" in text and "<pre>--set" not in text
+    assert "without an id" in text
+
+
+def test_what_a_listed_cluster_sets_is_given_back(tmp_path):
+    listed = LISTED.replace(
+        "</emitter>",
+        """<float name="distance_ratio" value="1.75"/> <integer name="resolution" value="8"/>
+        <point name="center" x="0.4" y="0.2" z="-1.5"/> </emitter>""",
+    )
+    text = html.unescape(inspect(tmp_path, listed))
+    (flags,) = re.findall(r"<pre>(--set .*\.shapes=.*)</pre>", text)
+    assert shlex.split(flags)[1::2] == [
+        "desk.shapes=ball & co",
+        "desk.distance_ratio=1.75",
+        "desk.center=0.4,0.2,-1.5",
+        "desk.resolution=8",
+    ]
+    (xml,) = re.findall(r"<pre>(<emitter.*?)</pre>", text, re.DOTALL)
+    request, again = (
+        mi.load_string(f'<scene version="3.0.0">{scene}</scene>').integrator().requests[0]
+        for scene in (listed, f'<integrator type="envmap_hybrid">{xml}</integrator>')
+    )
+    assert again == request
+    assert "--set no_cluster" not in text  # Which is refused for what is listed.
+
+
 def test_json(tmp_path, capfd):
     path = tmp_path / "room.xml"
     path.write_text(SCENE.format(more=""))
@@ -171,7 +237,8 @@ def test_clusters_that_are_not_seen_are_named():
     index = [sensor.film().size()[0] for sensor in scene.sensors()].index(16)
     (view,) = survey(scene, scene.sensors()[index], ours, 4, 0).view.clusters
     assert view.seen == 0 and view.shapes == {"ball": 0.0}
-    assert "no_cluster" in " ".join(about_cluster(view))
+    # "no_cluster" is for automatic clusters: what is listed must not be named there.
+    assert "Take desk out of the integrator" in " ".join(about_cluster(view))
 
 
 def test_warnings_are_kept():
@@ -306,7 +373,8 @@ def test_scales():
     ],
 )
 def test_advice(served, masked, words):
-    view = ClusterView(cube((0, 0, 0), 1), masked, {"ball & co": 0.1, "": 0.2}, 0.1, served)
+    members, shapes = Members(("ball & co",), unnamed=1, share=0.3), {"ball & co": 0.1, "": 0.2}
+    view = ClusterView(cube((0, 0, 0), 1), masked, members, shapes, 0.1, served)
     assert words in " ".join(about_cluster(view))
     assert not {"lower", "Raise"} <= set(" ".join(about_cluster(view)).split())
     # What it gives to be changed by hand loads.
@@ -317,4 +385,4 @@ def test_advice(served, masked, words):
     assert loaded.requests[0].shapes == ("ball & co",)
     assert loaded.requests[0].distance_ratio == 2
     assert shlex.split(as_flags(view))[1] == "cluster0.shapes=ball & co"
-    assert shlex.split(as_flags(view))[-1] == "no_cluster=ball & co"
+    assert shlex.split(without(view))[-1] == "no_cluster=ball & co"

@@ -91,7 +91,7 @@ def listed_clusters(
         ratio = request.distance_ratio or distance_ratio
         cluster = _cluster(request.name, points.position[member], ratio, request.center)
         box = scene.bbox()  # The sensors may have seen a part of it only.
-        if _holds(cluster, *points.box) and _holds(cluster, box.min, box.max):
+        if holds(cluster, *points.box) and holds(cluster, box.min, box.max):
             mi.Log(
                 mi.LogLevel.Warn,
                 f"{owner}: its cube holds the whole scene, so there is nothing to map; set a "
@@ -173,7 +173,7 @@ def find_clusters(
     for g in best:
         member = contents[np.isin(voxel, kept[group == g])]
         cluster = _cluster(f"cluster{len(clusters)}", points.position[member], distance_ratio)
-        if not _holds(cluster, *points.box):
+        if not holds(cluster, *points.box):
             cluster_of_point[member] = len(clusters)
             clusters.append(cluster)
     return clusters, cluster_of_point
@@ -252,7 +252,7 @@ def _cluster(
     return Cluster(name, centre, radius, distance_ratio * radius)
 
 
-def _holds(cluster: Cluster, low, high) -> bool:
+def holds(cluster: Cluster, low, high) -> bool:
     """Does the cube hold the whole box [3], so that nothing is left for a map?"""
     inside = (cluster.centre - cluster.half_width <= np.ravel(low)) & (
         cluster.centre + cluster.half_width >= np.ravel(high)
