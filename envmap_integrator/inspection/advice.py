@@ -73,13 +73,21 @@ def about_cluster(view: ClusterView) -> list[str]:
     """What is odd about a cluster, and what mends it."""
     cluster, (traced, cached, mapped) = view.cluster, view.served
     ratio = f"distance_ratio (here {cluster.half_width / cluster.radius:.3g})"
+    # Looking maps up costs where they are seen, as part of what it costs all over the picture.
+    cost = view.seen * LOOK_UP_COST
     found = []
     if view.seen == 0:
-        found.append(f"This sensor doesn't see it. {_leave_out(view)}")
+        found.append(f"This sensor doesn't see it.{_leave_out(view)}")
+    elif cluster.benefit < cost:
+        found.append(
+            f"Its map isn't worth having: it takes {percent(cluster.benefit)} of the noise off at "
+            f"most, less than the {percent(cost)} of the time that looking it up costs."
+            + _leave_out(view)
+        )
     if cached > mapped and traced > TRACED_ON:
         found.append(
             "Few rays come to use the map, with this cube, a smaller or a larger one: many hit "
-            f"something inside it, and many are traced on. {_leave_out(view)}"
+            f"something inside it, and many are traced on.{_leave_out(view)}"
         )
     elif cached > mapped:
         found.append(
@@ -101,9 +109,10 @@ def about_cluster(view: ClusterView) -> list[str]:
 
 
 def _leave_out(view: ClusterView) -> str:
+    """How to do without a cluster, as a further sentence; nothing if there is no way."""
     if view.members.request:
-        return f"Take {view.cluster.name} out of the integrator."
-    return "no_cluster leaves its shapes out."
+        return f" Take {view.cluster.name} out of the integrator."
+    return " no_cluster leaves its shapes out." if view.members.listed else ""
 
 
 def about_listing(view: ClusterView) -> list[str]:

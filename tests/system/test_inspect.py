@@ -25,6 +25,7 @@ from envmap_integrator.inspection.unfolded import MASKED, SKY, Faces, unfolded
 from envmap_integrator.inspection.wires import wires
 from envmap_integrator.lookup.cube import face_to_direction
 from envmap_integrator.lookup.cube_map import Cluster, CubeMap
+from envmap_integrator.preparation.maps.clusters import ClusterRequest
 from envmap_integrator.system.warned import warned
 from tests.helpers import block, camera, cluster, colour, grey, integrator, load, room
 
@@ -374,7 +375,8 @@ def test_scales():
 )
 def test_advice(served, masked, words):
     members, shapes = Members(("ball & co",), unnamed=1, share=0.3), {"ball & co": 0.1, "": 0.2}
-    view = ClusterView(cube((0, 0, 0), 1), masked, members, shapes, 0.1, served)
+    pays = replace(cube((0, 0, 0), 1), benefit=0.02)
+    view = ClusterView(pays, masked, members, shapes, 0.1, served)
     assert words in " ".join(about_cluster(view))
     assert not {"lower", "Raise"} <= set(" ".join(about_cluster(view)).split())
     # What it gives to be changed by hand loads.
@@ -386,3 +388,21 @@ def test_advice(served, masked, words):
     assert loaded.requests[0].distance_ratio == 2
     assert shlex.split(as_flags(view))[1] == "cluster0.shapes=ball & co"
     assert shlex.split(without(view))[-1] == "no_cluster=ball & co"
+
+
+def test_a_map_that_is_not_worth_having_is_told_so_first():
+    """Looking it up costs 12 % of the time where it's seen, 0.3 of the picture."""
+    members = Members(("ball",))
+    for benefit, pays in ((0.05, True), (0.03, False)):
+        its = replace(cube((0, 0, 0), 1), benefit=benefit)
+        said = about_cluster(ClusterView(its, 0.0, members, {}, 0.3, (0.1, 0.7, 0.2)))
+        assert any("lower distance_ratio" in remark for remark in said)
+        assert ("3\u00a0% of the noise off at most, less than the 3.6" in said[0]) != pays
+    asked = replace(members, request=ClusterRequest("cluster0", ("ball",)))
+    for its, words in (
+        (asked, "Take cluster0 out"),
+        (members, "no_cluster"),
+        (Members(()), "costs."),
+    ):
+        view = ClusterView(cube((0, 0, 0), 1), 0.0, its, {}, 0.3, (0.1, 0.2, 0.7))
+        assert words in about_cluster(view)[0]
