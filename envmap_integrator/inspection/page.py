@@ -19,7 +19,7 @@ from . import advice
 from .pictures import eight_bits, embedded, on_ramp, ramp_css, shrunk, tone_mapped, white_of
 from .survey import ClusterView, Survey, View, survey
 from .unfolded import Faces, unfolded
-from .wires import Wires, wires
+from .wires import LABEL, Wires, labels, wires
 
 #: Ends of the scale of relative errors.
 LEAST_ERROR, MOST_ERROR = 0.01, 1.0
@@ -97,7 +97,8 @@ def inspect(
     spp = spp or sensor.sampler().sample_count()
     settings = settings or {"spp": spp, "seed": seed, "integrator": integrator}
     found = survey(scene, sensor, integrator, spp, seed)
-    text = _page(template, found, scene, sensor, settings)
+    title = f"{scene_name(settings)} — what {integrator.owner} does"
+    text = _page(template, title, found, scene, sensor, settings)
     with replacing(path) as file:
         file.write(text.encode())
 
@@ -118,14 +119,21 @@ def _load_template() -> Any:
     return environment.get_template("page.html.j2")
 
 
+def scene_name(settings: dict[str, object]) -> str:
+    """What the scene goes by; files of many are called scene.xml."""
+    path = Path(str(settings.get("scene", "A scene"))).resolve()
+    return path.parent.name if path.stem == "scene" else path.stem
+
+
 def _page(
     template: Any,
+    title: str,
     survey: Survey,
     scene: mi.Scene,
     sensor: mi.Sensor,
     settings: dict[str, object],
 ) -> str:
-    """The page of a survey; ``settings`` are shown as they are, ``scene`` among them on top."""
+    """The page of a survey; ``settings`` are shown as they are."""
     view = survey.view
     aovs = {name: shrunk(picture) for name, picture in view.aovs.items()}
     picture = shrunk(survey.picture)
@@ -136,8 +144,10 @@ def _page(
     error = aovs["irradiance_error"][..., 0] / np.where(lit, mean, 1)
     height, width = survey.picture.shape[:2]
     with_maps = survey.mapped or view
+    clusters = _clusters(with_maps, scene, sensor)
+    centres = {shown.view.cluster.name: shown.wires.centre for shown in clusters}
     return template.render(
-        title=settings.get("scene", "a scene"),
+        title=title,
         survey=survey,
         in_short=advice.in_short(survey),
         state=view.state,
@@ -158,7 +168,9 @@ def _page(
         height=height,
         objects=embedded(_objects(picture, white, with_maps)),
         served_by_maps=embedded(_served({n: shrunk(p) for n, p in with_maps.aovs.items()})),
-        clusters=_clusters(with_maps, scene, sensor),
+        clusters=clusters,
+        labels=labels(centres, width, height),
+        label_size=LABEL * width,
         faces=Faces.of(sensor).names(),
         look_up_cost=LOOK_UP_COST,
         settings=settings,

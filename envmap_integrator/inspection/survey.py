@@ -77,7 +77,7 @@ class Survey:
     rays          of each sample of a pixel, by kind: see ``system.ray_counts``
     patches       numbers of patches: in use, of these for indirect light alone, and left out
     patch_samples gather rays of each at least, None if they were sent long ago
-    warnings      what Mitsuba has logged
+    warnings      what Mitsuba has warned of, each once
     """
 
     picture: np.ndarray
@@ -128,7 +128,7 @@ def survey(
         rays,
         _patches(view.state),
         None if integrator.cache_file else settings.patch_samples,
-        warnings,
+        list(dict.fromkeys(warnings)),
     )
 
 

@@ -11,6 +11,8 @@ import numpy as np
 
 from ..lookup.cube_map import Cluster
 
+#: Height of a label, as a part of the picture's width, and the width of its letters, of its height.
+LABEL, LETTER = 1 / 45, 0.6
 #: Points along an edge: what lies outside of the picture is left out point by point.
 POINTS = 96
 
@@ -21,11 +23,11 @@ class Wires:
 
     lines   [K, 2] points of each, pixels from the upper left corner, and whether it's hidden behind
             surfaces
-    label   [2] where its centre is, None if that isn't in the picture
+    centre  [2] where its centre is, None if that isn't in the picture
     """
 
     lines: list[tuple[np.ndarray, bool]]
-    label: np.ndarray | None
+    centre: np.ndarray | None
 
 
 def wires(scene: mi.Scene, sensor: mi.Sensor, cluster: Cluster) -> Wires:
@@ -53,6 +55,30 @@ def wires(scene: mi.Scene, sensor: mi.Sensor, cluster: Cluster) -> Wires:
             if value and len(run) > 1:
                 lines.append((place[first + np.array(run)], value == 1))
     return Wires(lines, place[-1] if inside[-1] else None)
+
+
+def labels(
+    places: dict[str, np.ndarray | None], width: int, height: int
+) -> dict[str, tuple[float, float]]:
+    """Middles of labels near their places: inside the picture, and apart as far as there's room.
+
+    Those without a place have none.
+    """
+    size, placed = LABEL * width, {}
+    for name, place in places.items():
+        if place is None:
+            continue
+        half = np.array([LETTER * size * len(name), 1.2 * size]) / 2
+        # Up and down, the nearest first.
+        steps = sorted(range(-len(places), len(places) + 1), key=abs)
+        tried = [place + (0, 2 * step * half[1]) for step in steps]
+        tried = np.clip(tried, half, np.maximum((width, height) - half, half))
+        apart = [
+            all((np.abs(middle - other) >= half + its).any() for other, its in placed.values())
+            for middle in tried
+        ]
+        placed[name] = tried[int(np.argmax(apart))], half  # The first, if there's no room.
+    return {name: tuple(middle.tolist()) for name, (middle, _) in placed.items()}
 
 
 def _projected(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
+import itertools
 import json
 import re
 import shlex
@@ -19,10 +20,11 @@ from envmap_integrator.cli import main
 from envmap_integrator.inspection.advice import about_cluster, as_flags, as_xml, in_short, without
 from envmap_integrator.inspection.members import Members
 from envmap_integrator.inspection.page import inspect as write_page
+from envmap_integrator.inspection.page import scene_name
 from envmap_integrator.inspection.pictures import RAMP, embedded, on_ramp, shrunk, tone_mapped
 from envmap_integrator.inspection.survey import ClusterView, survey
 from envmap_integrator.inspection.unfolded import MASKED, SKY, Faces, unfolded
-from envmap_integrator.inspection.wires import wires
+from envmap_integrator.inspection.wires import labels, wires
 from envmap_integrator.lookup.cube import face_to_direction
 from envmap_integrator.lookup.cube_map import Cluster, CubeMap
 from envmap_integrator.preparation.maps.clusters import ClusterRequest
@@ -96,6 +98,7 @@ def test_a_page_has_all_parts_and_needs_nothing_else(tmp_path):
     assert "ball &amp; co" in text and "<polyline" in text
     for stage in ("coarse mesh", "direct light", "irradiance cache", "clusters", "maps"):
         assert f"<td>{stage}</td>" in text
+    assert "<title>room — what envmap_hybrid does</title>" in text and "<details>" not in text
     assert "integrator: envmap_hybrid" in text and "patches = 512" in text
 
 
@@ -230,7 +233,7 @@ def test_a_survey_is_of_the_render_asked_for():
     assert found.rays["unbounded"] > 0.5 and "survey" not in found.rays
 
 
-def test_clusters_that_are_not_seen_are_named():
+def test_clusters_that_are_not_seen_are_named(tmp_path):
     """A sensor that looks away from the ball, which another one sees."""
     away = camera(16, 12, origin=(0, 0, -1), target=(-9, 0, -1))
     scene = load(room(sensor2=away))
@@ -240,6 +243,10 @@ def test_clusters_that_are_not_seen_are_named():
     assert view.seen == 0 and view.shapes == {"ball": 0.0}
     # "no_cluster" is for automatic clusters: what is listed must not be named there.
     assert "Take desk out of the integrator" in " ".join(about_cluster(view))
+    write_page(tmp_path / "page.html", scene, ours, sensor=index, spp=4)
+    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+    folded = text[text.index("<details>") : text.index("</details>")]
+    assert "Not seen by this sensor: desk" in folded and "radiance around desk" in folded
 
 
 def test_warnings_are_kept():
@@ -251,7 +258,7 @@ def test_warnings_are_kept():
         return prepare(*arguments)
 
     ours.prepare = loud
-    assert any("too dark" in w for w in survey(scene, scene.sensors()[0], ours, 4, 0).warnings)
+    assert survey(scene, scene.sensors()[0], ours, 4, 0).warnings.count("too dark") == 1
 
 
 # ---------------------- Cubes ----------------------
@@ -277,7 +284,7 @@ def test_wires_are_where_a_sensor_sees_them():
     for points, largest in ((solid, near), (pale, 100 / 5.5)):
         assert np.abs(points - middle).max() == pytest.approx(largest, abs=0.3)
     assert np.abs(pale - middle).max(axis=1).min() == pytest.approx(far, abs=0.1)
-    np.testing.assert_allclose(drawn.label, middle, atol=1e-3)
+    np.testing.assert_allclose(drawn.centre, middle, atol=1e-3)
 
 
 def test_wires_stay_in_the_picture():
@@ -288,7 +295,25 @@ def test_wires_stay_in_the_picture():
     points = np.concatenate([points for points, _ in drawn.lines])
     assert (points >= 0).all() and (points <= (WIDTH, HEIGHT)).all()
     nothing = wires(scene, sensor, cube((0, -9, 0.4), 1))
-    assert nothing.lines == [] and nothing.label is None
+    assert nothing.lines == [] and nothing.centre is None
+
+
+def test_labels_are_inside_and_apart():
+    width, height, size = 450, 300, 10
+    corners = {f"cluster{i}": np.array([x, 300.0]) for i, x in enumerate((0, 450, 440, 445))}
+    placed = labels(corners | {"far": np.array([200.0, 100]), "none": None}, width, height)
+    assert placed.pop("far") == (200, 100) and set(placed) == set(corners)
+    half = 0.3 * size * len("cluster0")
+    for x, y in placed.values():
+        assert half <= x <= width - half and size / 2 <= y <= height - size / 2
+    for (x, y), (u, v) in itertools.combinations(placed.values(), 2):
+        assert abs(x - u) >= 2 * half or abs(y - v) >= size
+    assert len(labels(dict.fromkeys(map(str, range(99)), np.zeros(2)), 9, 9)) == 99  # No room.
+
+
+@pytest.mark.parametrize("path", ["paper_room.xml", "paper_room/scene.xml"])
+def test_pages_go_by_the_name_of_the_scene(path):
+    assert scene_name({"scene": path}) == "paper_room"
 
 
 # ---------------------- Maps ----------------------
