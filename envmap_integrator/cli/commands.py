@@ -27,6 +27,7 @@ from envmap_integrator.system.atomic import check_writable
 from envmap_integrator.system.checks import check_size, sensor_of
 from envmap_integrator.system.llvm import ensure_llvm
 from envmap_integrator.system.printed import plain, printed
+from envmap_integrator.system.progress import stage
 from envmap_integrator.system.scene_file import DEFAULT_INTEGRATOR, SceneFile
 
 
@@ -239,7 +240,7 @@ def inspect(args: argparse.Namespace) -> int:
     _configure_machine(args)
     seconds: dict[str, float] = {}
     with record_kernels():
-        with measure(seconds, "load"):
+        with measure(seconds, "load"), stage("Loading the scene"):
             scene_file = SceneFile(args.scene, dict(args.define))
             ours = scene_file.integrator.plugin_name() in INSPECTED
             name = args.integrator or (None if ours else DEFAULT_INTEGRATOR)
@@ -279,7 +280,7 @@ def _configure_machine(args: argparse.Namespace) -> None:
 def _load(
     args: argparse.Namespace, seconds: dict[str, float], merge_meshes: bool = True
 ) -> tuple[SceneFile, mi.Scene]:
-    with measure(seconds, "load"):
+    with measure(seconds, "load"), stage("Loading the scene"):
         scene_file = SceneFile(args.scene, dict(args.define))
         scene_file.configure_integrator(args.integrator, dict(args.set))
         if getattr(args, "denoise", False):
@@ -335,8 +336,8 @@ def _report(
         return
     table = Table("stage", "seconds", box=None)
     table.columns[1].justify = "right"
-    for stage, duration in seconds.items():
-        table.add_row(stage, f"{duration:.2f}", style="bold" if stage == "total" else "")
+    for name, duration in seconds.items():
+        table.add_row(name, f"{duration:.2f}", style="bold" if name == "total" else "")
     table.add_row("of it compiling kernels", f"{compilation:.2f}", style="dim")
     console = Console()
     console.print(table)

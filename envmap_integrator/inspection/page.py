@@ -14,6 +14,7 @@ from ..imaging.aovs import false_colour
 from ..preparation.maps.clusters import LOOK_UP_COST
 from ..system.atomic import check_writable, replacing
 from ..system.checks import check_size, sensor_of
+from ..system.progress import stage
 from ..system.scene_file import DEFAULT_INTEGRATOR
 from . import advice
 from .pictures import eight_bits, embedded, on_ramp, ramp_css, shrunk, tone_mapped, white_of
@@ -96,9 +97,11 @@ def inspect(
     check_size(sensor, spp)
     spp = spp or sensor.sampler().sample_count()
     settings = settings or {"spp": spp, "seed": seed, "integrator": integrator}
-    found = survey(scene, sensor, integrator, spp, seed)
+    with stage("Inspecting"):
+        found = survey(scene, sensor, integrator, spp, seed)
     title = f"{scene_name(settings)} — what {integrator.owner} does"
-    text = _page(template, title, found, scene, sensor, settings)
+    with stage("Making the page"):
+        text = _page(template, title, found, scene, sensor, settings)
     with replacing(path) as file:
         file.write(text.encode())
 

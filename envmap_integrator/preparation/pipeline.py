@@ -13,6 +13,7 @@ import numpy as np
 from ..lookup.cube_map import CubeMap
 from ..lookup.lookup import Lookup
 from ..system.memory import check_memory
+from ..system.progress import stage
 from ..transport.camera import camera_radiance
 from ..transport.rules import as_baked
 from .baked_state import BakedState, Settings, StateKey
@@ -44,6 +45,7 @@ POINTS_PER_PATCH = 24
 PATCH_MEMORY, RAY_MEMORY, TEXEL_MEMORY = 10000, 40, 130
 
 
+@stage("Preparing")
 def prepare(
     scene: mi.Scene,
     state: SceneState,
@@ -182,6 +184,7 @@ def _baked(scene, lookup, clusters, members, settings, owner, kept) -> tuple[Cub
 @contextmanager
 def _timed(times: dict[str, float], name: str):
     begin = time.perf_counter()
-    yield
-    dr.sync_thread()
+    with stage(name.capitalize()):
+        yield
+        dr.sync_thread()
     times[name] = times.get(name, 0.0) + time.perf_counter() - begin

@@ -1,4 +1,4 @@
-"""A progress bar for the stages that make the user wait, and nothing for those that don't."""
+"""What goes on now, for who waits, and how far it is: a bar for each stage but the shortest."""
 
 from __future__ import annotations
 
@@ -11,18 +11,29 @@ from rich.console import Console
 from rich.progress import (
     BarColumn,
     Progress,
+    Task,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.text import Text
 
 quiet = False
 """Set to True to show no bars in this process."""
 
-DELAY = 2.0
+DELAY = 0.3
 """Seconds that a stage may last before its bar appears."""
 
 _display: Progress | None = None
+
+
+class _TimeLeft(TimeRemainingColumn):
+    """The time that is left; nothing while that isn't known."""
+
+    def render(self, task: Task) -> Text:
+        if task.time_remaining is None:
+            return Text()
+        return Text.assemble("left: ", super().render(task))
 
 
 @contextmanager
@@ -43,14 +54,14 @@ def stage(name: str, total: float | None = None) -> Iterator[Callable[[float], N
     outermost = _display is None
     display = _display = _display or Progress(
         TextColumn("{task.description}"), BarColumn(),
-        TimeElapsedColumn(), TextColumn("left:"), TimeRemainingColumn(),
+        TimeElapsedColumn(), _TimeLeft(),
         console=console, transient=True,
     )  # fmt: skip
     task = display.add_task(name, total=total, visible=False)
 
     def show() -> None:
-        display.update(task, visible=True)
         display.start()
+        display.update(task, visible=True, refresh=True)
 
     timer = Timer(DELAY, show)
     timer.daemon = True

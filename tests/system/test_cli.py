@@ -104,6 +104,36 @@ def test_quiet_is_for_one_command(scene, monkeypatch, before):
         assert progress.quiet == before
 
 
+@pytest.mark.parametrize("command", ["render", "inspect"])
+def test_terminals_show_what_goes_on(tmp_path, capsys, monkeypatch, command):
+    """From loading on; to others nothing is shown."""
+    scene = write_scene(tmp_path, "")
+    monkeypatch.setattr(progress, "Timer", AtOnce)
+    options = (scene, "--spp", 4, "--set", "patches=256")
+    assert run(command, *options) == 0
+    assert capsys.readouterr().err == ""
+    monkeypatch.setenv("ENVMAP_PROGRESS", "1")
+    assert run(command, *options) == 0
+    shown = capsys.readouterr().err
+    for stage in ("Loading the scene", "Preparing", "Coarse mesh", "Irradiance cache", "Rendering"):
+        assert stage in shown
+    assert ("Inspecting" in shown) == (command == "inspect")
+    assert run(command, *options, "--quiet") == 0
+    assert capsys.readouterr().err == ""
+
+
+class AtOnce:
+    """A timer that doesn't wait."""
+
+    def __init__(self, delay: float, function):
+        self.start = function
+
+    def cancel(self) -> None:
+        pass
+
+    join = cancel
+
+
 def test_json(tmp_path, capfd):
     """One object on stdout, and nothing else."""
     scene = write_scene(tmp_path, "")

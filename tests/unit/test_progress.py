@@ -40,6 +40,24 @@ def test_a_short_stage_shows_no_bar(capsys, forced, monkeypatch):
     assert "outer" not in capsys.readouterr().err
 
 
+def test_what_makes_the_user_wait_is_shown_soon(capsys, monkeypatch):
+    monkeypatch.setenv("ENVMAP_PROGRESS", "1")
+    with progress.stage("loading"):
+        time.sleep(1)
+    assert "loading" in capsys.readouterr().err
+
+
+def test_the_time_that_is_left_is_told_where_it_is_known(capsys, forced):
+    with progress.stage("solving"):
+        time.sleep(0.2)
+    assert "left:" not in capsys.readouterr().err
+    with progress.stage("gathering", total=30) as advance:
+        for _ in range(10):
+            time.sleep(0.1)
+            advance(1)
+    assert "left: " in capsys.readouterr().err
+
+
 def test_quiet(capsys, forced, monkeypatch):
     monkeypatch.setattr(progress, "quiet", True)
     run_stages()
