@@ -213,7 +213,7 @@ def _clusters(view: View, scene: mi.Scene, sensor: mi.Sensor) -> list[Shown]:
                 far=far,
                 shapes=shapes[: advice.MOST_SHAPES],
                 n_shapes=len(shapes),
-                remarks=advice.about_cluster(cluster),
+                remarks=advice.about_cluster(cluster, len(view.clusters)),
                 unlisted=advice.about_listing(cluster),
                 xml=advice.as_xml(cluster),
                 flags=advice.as_flags(cluster),

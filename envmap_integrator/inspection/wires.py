@@ -11,7 +11,7 @@ import numpy as np
 
 from ..lookup.cube_map import Cluster
 
-#: Height of a label, as a part of the picture's width, and the width of its letters, of its height.
+#: Height of a label, as a part of the picture's longer side, and width of its letters, of that.
 LABEL, LETTER = 1 / 45, 0.6
 #: Points along an edge: what lies outside of the picture is left out point by point.
 POINTS = 96
@@ -64,7 +64,7 @@ def labels(
 
     Those without a place have none.
     """
-    size, placed = LABEL * width, {}
+    size, placed = LABEL * max(width, height), {}
     for name, place in places.items():
         if place is None:
             continue
