@@ -69,19 +69,19 @@ def _about_maps(survey: Survey) -> str:
     )
 
 
-def about_cluster(view: ClusterView) -> list[str]:
-    """What is odd about a cluster, and what mends it."""
+def about_cluster(view: ClusterView, n_clusters: int) -> list[str]:
+    """What is odd about a cluster, one of so many, and what mends it."""
     cluster, (traced, cached, mapped) = view.cluster, view.served
     ratio = f"distance_ratio (here {cluster.half_width / cluster.radius:.3g})"
-    # Looking maps up costs where they are seen, as part of what it costs all over the picture.
-    cost = view.seen * LOOK_UP_COST
+    # Looking maps up costs everywhere, whatever the size of a cluster: each has to pay its part.
+    cost = LOOK_UP_COST / n_clusters
     found = []
     if view.seen == 0:
         found.append(f"This sensor doesn't see it.{_leave_out(view)}")
     elif cluster.benefit < cost:
         found.append(
             f"Its map isn't worth having: it takes {percent(cluster.benefit)} of the noise off at "
-            f"most, less than the {percent(cost)} of the time that looking it up costs."
+            f"most, less than its part of what looking maps up costs, {percent(cost)} of the time."
             + _leave_out(view)
         )
     if cached > mapped and traced > TRACED_ON:

@@ -173,7 +173,7 @@ def _page(
         served_by_maps=embedded(_served({n: shrunk(p) for n, p in with_maps.aovs.items()})),
         clusters=clusters,
         labels=labels(centres, width, height),
-        label_size=LABEL * width,
+        label_size=LABEL * max(width, height),
         faces=Faces.of(sensor).names(),
         look_up_cost=LOOK_UP_COST,
         settings=settings,

@@ -242,7 +242,7 @@ def test_clusters_that_are_not_seen_are_named(tmp_path):
     (view,) = survey(scene, scene.sensors()[index], ours, 4, 0).view.clusters
     assert view.seen == 0 and view.shapes == {"ball": 0.0}
     # "no_cluster" is for automatic clusters: what is listed must not be named there.
-    assert "Take desk out of the integrator" in " ".join(about_cluster(view))
+    assert "Take desk out of the integrator" in " ".join(about_cluster(view, 4))
     write_page(tmp_path / "page.html", scene, ours, sensor=index, spp=4)
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     folded = text[text.index("<details>") : text.index("</details>")]
@@ -400,10 +400,10 @@ def test_scales():
 )
 def test_advice(served, masked, words):
     members, shapes = Members(("ball & co",), unnamed=1, share=0.3), {"ball & co": 0.1, "": 0.2}
-    pays = replace(cube((0, 0, 0), 1), benefit=0.02)
+    pays = replace(cube((0, 0, 0), 1), benefit=0.04)
     view = ClusterView(pays, masked, members, shapes, 0.1, served)
-    assert words in " ".join(about_cluster(view))
-    assert not {"lower", "Raise"} <= set(" ".join(about_cluster(view)).split())
+    assert words in " ".join(about_cluster(view, 4))
+    assert not {"lower", "Raise"} <= set(" ".join(about_cluster(view, 4)).split())
     # What it gives to be changed by hand loads.
     text = as_xml(view)
     loaded = mi.load_string(
@@ -416,18 +416,18 @@ def test_advice(served, masked, words):
 
 
 def test_a_map_that_is_not_worth_having_is_told_so_first():
-    """Looking it up costs 12 % of the time where it's seen, 0.3 of the picture."""
+    """Looking maps up costs 12 % of the time, a quarter of that for each of four."""
     members = Members(("ball",))
-    for benefit, pays in ((0.05, True), (0.03, False)):
+    for benefit, pays in ((0.04, True), (0.02, False)):
         its = replace(cube((0, 0, 0), 1), benefit=benefit)
-        said = about_cluster(ClusterView(its, 0.0, members, {}, 0.3, (0.1, 0.7, 0.2)))
+        said = about_cluster(ClusterView(its, 0.0, members, {}, 0.3, (0.1, 0.7, 0.2)), 4)
         assert any("lower distance_ratio" in remark for remark in said)
-        assert ("3\u00a0% of the noise off at most, less than the 3.6" in said[0]) != pays
+        assert ("takes 2\u00a0% of the noise off at most" in said[0]) != pays
     asked = replace(members, request=ClusterRequest("cluster0", ("ball",)))
     for its, words in (
         (asked, "Take cluster0 out"),
         (members, "no_cluster"),
-        (Members(()), "costs."),
+        (Members(()), "of the time."),
     ):
         view = ClusterView(cube((0, 0, 0), 1), 0.0, its, {}, 0.3, (0.1, 0.2, 0.7))
-        assert words in about_cluster(view)[0]
+        assert words in about_cluster(view, 4)[0]
