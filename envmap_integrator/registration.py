@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import importlib
+import re
 import sys
+from difflib import get_close_matches
+from functools import partial
 
 import mitsuba as mi
 
@@ -24,6 +27,8 @@ PLUGINS = {
     "mipmap_cube": ("emitters.mipmap_cube", "MipmapCube"),
 }
 _EMITTERS = ("mipmap_cube",)
+#: A parameter's name in the documentation of a plugin.
+_PARAMETER = re.compile(r"^ +\* - (\w+)$", re.MULTILINE)
 
 
 def register() -> None:
@@ -48,4 +53,18 @@ def _register() -> None:
             importlib.import_module(full_name)
     for plugin, (module, name) in PLUGINS.items():
         register_plugin = mi.register_emitter if plugin in _EMITTERS else mi.register_integrator
-        register_plugin(plugin, getattr(sys.modules[f"{__package__}.{module}"], name))
+        kind = getattr(sys.modules[f"{__package__}.{module}"], name)
+        register_plugin(plugin, partial(_make, kind))
+
+
+def _make(kind: type, props: mi.Properties) -> mi.Object:
+    """A plugin; ``ValueError`` for a parameter that it hasn't read, with names that are near.
+
+    Mitsuba would refuse that, too, but without knowing the others.
+    """
+    made = kind(props)
+    for name in props.unqueried():
+        near = get_close_matches(name, _PARAMETER.findall(kind.__doc__ or ""))
+        mend = "".join(f'write "{each}" or ' for each in near) + "remove it"
+        raise ValueError(f'{props.plugin_name()}: there is no parameter "{name}"; {mend}')
+    return made

@@ -11,7 +11,7 @@ import numpy as np
 class Parameters:
     """Reads the properties of one plugin; every complaint names the plugin and the property.
 
-    Properties that nothing reads are left to Mitsuba, which rejects them by name.
+    Properties that nothing reads are rejected by name where plugins are registered.
     """
 
     def __init__(self, props: mi.Properties):

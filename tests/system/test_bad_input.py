@@ -33,7 +33,9 @@ def prepare(scene: dict, **settings) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"map_resolutoin": 64}, "map_resolutoin"),
+        ({"map_resolutoin": 64}, '"map_resolutoin"; write "map_resolution" or remove it'),
+        ({"depth_of_field": 64}, 'there is no parameter "depth_of_field"; remove it'),
+        ({"cube": cluster("ball") | {"centre": 1}}, '"centre"; write "center" or remove it'),
         ({"patches": 1}, '"patches" must be at least 16'),
         ({"patches": "many"}, '"patches" must be an integer'),
         ({"patches": 1000.5}, '"patches" must be an integer'),

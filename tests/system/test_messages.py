@@ -516,6 +516,10 @@ CASES = {
     "choice": Case(parameter("choice", "c", "a", ("a", "b")), '"x"', "'c'", '"a" or "b"'),
     "text": Case(parameter("text", 3), '"x"', "3", "must be a string"),
     "range": Case(parameter("integer", 9, 1, 1, 8), '"x"', "9", "at least 1 and at most 8"),
+    "misspelt": Case(
+        lambda _: integrator("envmap_hybrid", map_resolutoin=8),
+        "envmap_hybrid", '"map_resolutoin"', 'write "map_resolution" or remove it',
+    ),
     "AOV": Case(aovs("p:patch, depth"), "ours", '"depth"', "must list name:type"),
     "AOV twice": Case(aovs("a:patch, a:served"), "ours", 'two of the name "a"', "rename one"),
     "nested": Case(
