@@ -305,11 +305,10 @@ def _refusal(name: str, theirs: Any, ours: Any) -> str:
     if part == "name":
         return f'made without the cluster "{cluster}" (leave its mipmap_cube or --set out)'
     name, words = _AS_GIVEN.get(name, (name, {}))
-    made, asked = (
-        f"{name}={words.get(str(value), value)!r}" if value is not None else f"no {name}"
-        for value in (theirs, ours)
-    )
-    return f"made with {made}, not {asked} (pass the same settings as there)"
+    its, other = (f"{name}={words.get(str(value), value)!r}" for value in (theirs, ours))
+    made = f"with {its}" if theirs is not None else f"without {name}"
+    asked = other if ours is not None else "without"
+    return f"made {made}, not {asked} (pass the same settings as there)"
 
 
 def _image(values: np.ndarray) -> np.ndarray:
