@@ -292,8 +292,9 @@ _AS_GIVEN = {
 def _refusal(name: str, theirs: Any, ours: Any) -> str:
     """How a setting of ``_flat`` differs, and what to do, in words that users know."""
     if name == "maps":
-        kind = "with maps (envmap_hybrid)" if theirs else "without maps (such as one_level_path)"
-        return f"made for an integrator {kind} (use such a one)"
+        if theirs:
+            return "made for an integrator with maps (use envmap_hybrid)"
+        return "made for an integrator without maps (use the same one, such as one_level_path)"
     if name == "least_patch_samples":
         return "made for another integrator (use the same one)"
     cluster, _, part = name.rpartition(".")

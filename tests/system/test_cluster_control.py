@@ -102,7 +102,7 @@ def test_a_state_for_another_integrator_is_refused(scene, tmp_path):
             ) as caught:
                 reader.prepare(scene)
             reasons[made, asked] = str(caught.value)
-    assert "with maps (envmap_hybrid)" in reasons["envmap_hybrid", "one_level_path"]
+    assert "with maps (use envmap_hybrid)" in reasons["envmap_hybrid", "one_level_path"]
     assert "without maps" in reasons["one_level_path", "envmap_hybrid"]
 
 
