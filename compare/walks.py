@@ -22,10 +22,9 @@ from envmap_integrator.lookup.lookup import Lookup
 from envmap_integrator.system.jit import SpareNumbers, upload
 from envmap_integrator.system.ray_counts import Ray
 from envmap_integrator.transport import direct_light
-from envmap_integrator.transport.camera import follow_mirrors, leave
+from envmap_integrator.transport.camera import follow_mirrors, leads_on, leave
 from envmap_integrator.transport.direct_light import WideShare, sample_emitters
 from envmap_integrator.transport.ending import end_in_cache, serve
-from envmap_integrator.transport.lobes import is_delta
 from envmap_integrator.transport.path import direct_light as light_and_direction
 from envmap_integrator.transport.path import roulette, scatter
 from envmap_integrator.transport.rules import PathRules
@@ -43,7 +42,7 @@ MAX_LANES = 1 << 22
 class Event(IntEnum):
     """What is counted.
 
-    CAMERA      camera hits, after mirrors and glass
+    CAMERA      camera hits, after mirrors, glass and holes
     SECONDARY   secondary rays that these send
     INSIDE      ... whose paths end among the surfaces that the worker holds
     MAP         ... in the map of the cluster
@@ -174,7 +173,7 @@ class Hits:
     """Camera samples and what they hit.
 
     ray      the last ray, from the sensor or from a mirror on the way
-    vertex   the first surface that isn't a mirror or glass
+    vertex   the first surface but mirrors, glass and holes
     owner    its cluster, the number of clusters if it has none
     """
 
@@ -195,7 +194,7 @@ def camera_hits(
     ray, _ = sensor.sample_ray(time, 0.5, place, sampler.next_2d())
     ray = mi.Ray3f(ray)
     si = scene.ray_intersect(ray)
-    mirrored = si.is_valid() & is_delta(si.bsdf(ray))
+    mirrored = leads_on(si, ray, si.is_valid())
     si, ray, throughput, _, _ = follow_mirrors(scene, sampler, si, ray, mirrored)
     vertex = Vertex.met(lookup, si, ray, dr.max(throughput) > 0)
     owner = dr.select(vertex.cube.valid, vertex.cube.cluster, n_clusters)

@@ -27,7 +27,7 @@ class CameraSample:
     distance   [m]  to the first hit, infinite if there is none
     valid           whether there is one (alpha)
     gathered        the part of the radiance that pixels may share, None if there is none at all
-    vertex          the first surface that isn't a mirror or glass, None without secondary rays
+    vertex          the first surface but mirrors, glass and holes, None without secondary rays
     aovs            what else the film is to hold of it
     """
 
@@ -79,7 +79,7 @@ def split(
     ray: mi.Ray3f,
     active: mi.Bool,
 ) -> CameraSample:
-    """Shade the first surface that isn't a mirror or glass, and send secondary rays from it.
+    """Shade the first surface but mirrors, glass and holes, and send secondary rays from it.
 
     This vertex stands outside the loop over the others also for a single secondary ray: it needs no
     patch and those need hardly any shadow rays, which saves a fifth of the time.
