@@ -58,7 +58,7 @@ class Gathered:
         first is darker as their irradiance is unlike.
         """
         radiance, albedo = (colour(x, wavelengths) for x in (self.radiance, self.albedo))
-        weight = self.weight * dr.abs(dr.mean(self.albedo))
+        weight = self.weight * dr.abs(dr.sum(self.albedo))
         guides = (weight * x for x in (self.normal, self.position, self.nearness))
         return Gathered(radiance, albedo, *guides, weight)
 
