@@ -58,6 +58,7 @@ class Gathered:
         first is darker as their irradiance is unlike.
         """
         radiance, albedo = (colour(x, wavelengths) for x in (self.radiance, self.albedo))
+        # Not their mean: dividing isn't the same to the last bit in kernels of other pixels.
         weight = self.weight * dr.abs(dr.sum(self.albedo))
         guides = (weight * x for x in (self.normal, self.position, self.nearness))
         return Gathered(radiance, albedo, *guides, weight)
