@@ -20,6 +20,7 @@ from envmap_integrator.cli.doctor import doctor
 from envmap_integrator.cli.errors import condense
 from envmap_integrator.cli.export import export
 from envmap_integrator.system import progress
+from envmap_integrator.system.checks import SUPPORTED_VARIANTS
 from envmap_integrator.system.interrupt import interruptible
 
 EXIT_BAD_INPUT = 2
@@ -247,9 +248,10 @@ def _add_scene_options(parser: argparse.ArgumentParser) -> None:
         "-D", "--define", type=parse_assignment, action="append", default=[], metavar="KEY=VALUE",
         help="define $KEY of the scene description",
     )  # fmt: skip
-    parser.add_argument(
+    integrator = parser.add_argument(
         "--integrator", metavar="NAME", help="replaces the scene's; default: the scene's own"
     )
+    _offer(integrator, ("envmap_hybrid", "one_level_path", "source_selection", "path"))
     parser.add_argument(
         "--set", type=parse_setting, action="append", default=[], metavar="KEY=VALUE",
         help="integrator parameter: true, false, an integer, a float (1.0) or a string; "
@@ -266,6 +268,12 @@ def _add_scene_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_mode(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
+    mode = parser.add_argument(
         "-m", "--mode", default="llvm_ad_rgb", metavar="VARIANT", help="default: %(default)s"
     )
+    _offer(mode, SUPPORTED_VARIANTS)
+
+
+def _offer(option: argparse.Action, values: Sequence[str]) -> None:
+    """Have shells complete the values of an option; others can be given all the same."""
+    option.completer = lambda **_: values

@@ -189,9 +189,17 @@ def test_what_help_proposes_is_for_scenes_of_any_integrator(tmp_path, monkeypatc
         assert main([*words, "--spp", "17", "--set", "patches=64"]) == 0
 
 
-def test_shells_can_complete(tmp_path):
+@pytest.mark.parametrize(
+    "asked, answers",
+    [
+        ("--de", ["--debug", "--define", "--denoise"]),
+        ("--integrator e", ["envmap_hybrid"]),
+        ("-m llvm_ad_s", ["llvm_ad_spectral"]),
+    ],
+)
+def test_shells_can_complete(tmp_path, asked, answers):
     """As bash asks: what could follow ``envmap-render render --de``?"""
-    line = "envmap-render render --de"
+    line = f"envmap-render render {asked}"
     answer = tmp_path / "answer"
     environment = os.environ | {
         "_ARGCOMPLETE": "1",
@@ -203,7 +211,7 @@ def test_shells_can_complete(tmp_path):
     code = "from envmap_integrator.cli import main; main()"
     subprocess.run([sys.executable, "-c", code], env=environment, check=True)
     words = sorted(word.strip() for word in answer.read_text().split("\n"))
-    assert words == ["--debug", "--define", "--denoise"]
+    assert words == answers
 
 
 def test_integrator_of_the_scene_need_not_exist(tmp_path):
