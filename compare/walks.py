@@ -194,7 +194,7 @@ def camera_hits(
     ray, _ = sensor.sample_ray(time, 0.5, place, sampler.next_2d())
     ray = mi.Ray3f(ray)
     si = scene.ray_intersect(ray)
-    mirrored = leads_on(si, ray, si.is_valid())
+    mirrored = leads_on(si, ray, mi.Bool(True))
     si, ray, throughput, _, _ = follow_mirrors(scene, sampler, si, ray, mirrored)
     vertex = Vertex.met(lookup, si, ray, dr.max(throughput) > 0)
     owner = dr.select(vertex.cube.valid, vertex.cube.cluster, n_clusters)

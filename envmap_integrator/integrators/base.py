@@ -6,7 +6,7 @@ import hashlib
 import math
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 
 import drjit as dr
@@ -544,10 +544,9 @@ class GatheringIntegrator(CachedIntegrator):
 
 
 def _that_serves(
-    states: Iterable[BakedState], scene: mi.Scene, now: SceneState, view: mi.Sensor | None
+    states: Collection[BakedState], scene: mi.Scene, now: SceneState, view: mi.Sensor | None
 ) -> BakedState | None:
     """The first of some states that serves a view, with the error of its picture."""
-    states = list(states)
     for state in states:
         if view is None or view_name(view) in state.views:
             return state

@@ -96,7 +96,7 @@ def split(
     valid = shown & (scene.environment() is not None)
     throughput, on_mirrors = mi.Spectrum(1), mi.Spectrum(0)
     if dr.hint(lookup.far_field is None or not lookup.far_field.map_mirrors, mode="scalar"):
-        mirrored = leads_on(si, ray, active & si.is_valid())
+        mirrored = leads_on(si, ray, active)
         si, ray, throughput, on_mirrors, solid = follow_mirrors(scene, sampler, si, ray, mirrored)
         shown |= solid | (mirrored & si.is_valid())
         valid |= solid
@@ -179,14 +179,14 @@ def follow_mirrors(
         ray = dr.select(active, si.spawn_ray(si.to_world(bs.wo)), ray)
         count(Ray.UNBOUNDED, ray, active)
         si = dr.select(active, scene.ray_intersect(ray, active), si)
-        active &= leads_on(si, ray, active & si.is_valid())
+        active = leads_on(si, ray, active)
     return si, ray, throughput, emitted, solid
 
 
 def leads_on(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, active: mi.Bool) -> mi.Bool:
     """Is what is seen at a surface elsewhere: in a mirror, behind glass or a hole?"""
-    bsdf = si.bsdf(ray)
-    return active & (is_delta(bsdf) | lets_all_pass(bsdf, si, active))
+    bsdf, hit = si.bsdf(ray), active & si.is_valid()
+    return hit & (is_delta(bsdf) | lets_all_pass(bsdf, si, hit))
 
 
 def gathering(
